@@ -30,9 +30,9 @@ def solve_batch(
     SfM graphs are solved together as one graph with that many components, and ``stage_seconds`` are those of all. The
     linear systems are iterated until every component has converged, so answers differ from separate solves by the
     refinement's tolerance: up to a tenth of a standard error where cameras have few edges, 10⁻⁵ rad and less elsewhere.
-    Their ``warnings`` are those about edges that state nothing and about mostly flagged graphs; the warning that edges
-    which contradict the answer agree among themselves is given only for graphs solved alone. SLAM graphs, and methods
-    that are not ours, are solved one by one.
+    Their ``warnings`` are those about edges that state nothing and about mostly flagged graphs; the warnings that edges
+    which contradict the answer agree among themselves, and that another answer fits nearly as well, are given only for
+    graphs solved alone. SLAM graphs, and methods that are not ours, are solved one by one.
 
     Returns:
         a solution per graph, in their order.
