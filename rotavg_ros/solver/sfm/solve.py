@@ -37,7 +37,7 @@ from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 # For graphs with more edges it pays to measure which tile sizes are fastest on this machine.
 _TUNING_PAYS = 200_000
 _NEARLY_AS_GOOD = (
-    "of two answers, in which {} of {} orientations differ by more than 20°, neither fits clearly better; a part of the "
+    "of two answers, in which {} of {} orientations differ by more than 20°, neither fits clearly better; part of the "
     "views is joined to the rest by few edges, or by edges that contradict each other: look whether it fits, or match "
     "more pairs"
 )
