@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.residuals import edge_residual
+from rotavg_ros.solver.algebra.residuals import angles_after_alignment, edge_residual
 from rotavg_ros.solver.algebra.spanning_forest import (
     SpanningForest,
     accumulate_to_root,
@@ -151,7 +151,9 @@ def _gaps_of_places(graph: ViewGraph) -> str | None:
 
 
 def _far_from_odometry(odometry: _Odometry, body_from_world: Tensor, believed: int) -> str | None:
-    angle = float(_angles_after_alignment(odometry.orientation, body_from_world, odometry.component).mean())
+    component = odometry.component
+    apart = angles_after_alignment(odometry.orientation, body_from_world, component, int(component.max()) + 1)
+    angle = float(apart.mean())
     if angle <= _FAR:
         return None
     count = "1 believed loop closure turns" if believed == 1 else f"{believed} believed loop closures turn"
@@ -159,18 +161,6 @@ def _far_from_odometry(odometry: _Odometry, body_from_world: Tensor, believed: i
         f"{count} the orientations by {math.degrees(angle):.0f}° in the mean from odometry's; so few may be false "
         "together: look at them, label those that are wrong, or compare with odometry alone"
     )
-
-
-def _angles_after_alignment(a: Tensor, b: Tensor, component: Tensor) -> Tensor:
-    """``(N,)`` angles between orientations after the best alignment of the world in each component.
-
-    It is the chordal mean of a_v⁻¹ b_v: the first eigenvector of Σ q qᵀ (Markley et al. 2007).
-    """
-    turn = rotations.multiply(rotations.inverse(a), b)
-    moment = torch.zeros(int(component.max()) + 1, 4, 4, dtype=turn.dtype)
-    moment.index_add_(0, component, turn[:, :, None] * turn[:, None, :])
-    mean = torch.linalg.eigh(moment)[1][:, :, -1]
-    return rotations.angle_between(mean[component], turn)
 
 
 # Maps quaternions as stored, target_from_source ``(n, 4)``, to their reading under a hypothesis.

@@ -32,16 +32,12 @@ def follow(pointer: np.ndarray) -> np.ndarray:
     return end
 
 
-def levels(parent: np.ndarray) -> np.ndarray:
-    """``(N,)`` number of edges between each node of a forest and its root, which is its own parent."""
-    level = (parent != np.arange(len(parent))).astype(np.int64)
-    for ancestor, _ in doublings(parent):
-        level = level + level[ancestor]
-    return np.asarray(level)
-
-
 def lowest_common_ancestors(parent: np.ndarray, level: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """``(P,)`` where the ways upwards from nodes ``a`` and ``b``, of the same tree each, meet; ``level`` as above."""
+    """``(P,)`` where the ways upwards from nodes ``a`` and ``b``, of the same tree each, meet.
+
+    Args:
+        level: ``(N,)`` int, number of edges between each node and its root.
+    """
     jumps = [parent, *(farther for _, farther in doublings(parent))]
     low, high = np.where(level[a] >= level[b], a, b), np.where(level[a] >= level[b], b, a)
     excess = level[low] - level[high]
@@ -53,9 +49,9 @@ def lowest_common_ancestors(parent: np.ndarray, level: np.ndarray, a: np.ndarray
     return np.asarray(np.where(low == high, low, parent[low]))
 
 
-def sums_of_branches(parent: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """``(N,)`` sum of ``value`` over each node and all below it."""
-    jumps, level, total = [parent, *(farther for _, farther in doublings(parent))], levels(parent), value
+def sums_of_branches(parent: np.ndarray, level: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """``(N,)`` sum of ``value`` over each node and all below it; ``level`` as in :func:`lowest_common_ancestors`."""
+    jumps, total = [parent, *(farther for _, farther in doublings(parent))], value
     for power, jump in enumerate(jumps):
         # What lies less than 2^power edges below a node is in its sum already.
         (reaches,) = np.nonzero(level >= 1 << power)

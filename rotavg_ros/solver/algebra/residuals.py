@@ -101,3 +101,15 @@ def multiply_rows(a: Tensor, b: Tensor) -> Tensor:
     torch.mul(aw, bz, out=z).addcmul_(az, bw).addcmul_(ax, by).addcmul_(ay, bx, value=-1)
     torch.mul(aw, bw, out=w).addcmul_(ax, bx, value=-1).addcmul_(ay, by, value=-1).addcmul_(az, bz, value=-1)
     return product
+
+
+def angles_after_alignment(a: Tensor, b: Tensor, component: Tensor, count: int) -> Tensor:
+    """``(N,)`` angles between orientations after the best alignment of the world in each of ``count`` components.
+
+    It is the chordal mean of a_v⁻¹ b_v: the first eigenvector of Σ q qᵀ (Markley et al. 2007).
+    """
+    turn = rotations.multiply(rotations.inverse(a), b)
+    moment = turn.new_zeros(count, 4, 4)
+    moment.index_add_(0, component, turn[:, :, None] * turn[:, None, :])
+    mean = torch.linalg.eigh(moment)[1][:, :, -1]
+    return rotations.angle_between(mean[component], turn)

@@ -82,7 +82,7 @@ def test_the_change_of_each_turn_is_that_of_the_whole_cost() -> None:
     before = cost(graph, wrong(truth))
     for index in np.flatnonzero(known):
         chosen = np.arange(len(turns.node)) == index
-        after = Rotation.from_quat(parts._turned(rows, turns, chosen).T)
+        after = Rotation.from_quat(parts.turned(rows, turns, chosen).T)
         np.testing.assert_allclose(cost(graph, after) - before, turns.change[index], atol=1e-6)
 
 

@@ -13,8 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.residuals import EdgeResiduals
+from rotavg_ros.solver.algebra.residuals import EdgeResiduals, angles_after_alignment
 from rotavg_ros.solver.algebra.spanning_forest import compose_orientations, minimum_spanning_forest
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.consensus.density import Edges, Fitted, fitted
@@ -133,6 +132,5 @@ def _along_tree(graph: ViewGraph, votes: Tensor) -> np.ndarray:
 
 def _num_apart(one: Tensor, other: Tensor) -> int:
     """Number of orientations that are far apart in two answers, each ``(n, 4)`` in its own gauge."""
-    turn = rotations.multiply(rotations.inverse(one), other)
-    mean = torch.linalg.eigh(turn.t() @ turn).eigenvectors[:, -1]
-    return int((rotations.angle_between(turn, mean.expand_as(turn)) > NUMBERS.outlier_angle).sum())
+    together = torch.zeros(len(one), dtype=torch.int64)
+    return int((angles_after_alignment(one, other, together, 1) > NUMBERS.outlier_angle).sum())

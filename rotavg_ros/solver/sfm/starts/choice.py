@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.residuals import EdgeResiduals
+from rotavg_ros.solver.algebra.residuals import EdgeResiduals, angles_after_alignment
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.refinement import PRIORS, EdgeWeights, coarse_steps, settle, shaped_steps
@@ -206,16 +205,9 @@ def _where(problem: Problem, chosen: Tensor, one: Begun, other: Begun) -> Begun:
 
 def _share_apart(problem: Problem, one: Tensor, other: Tensor) -> Tensor:
     """``(C,)`` share of each component's nodes whose orientations in two solutions ``(N, 4)`` are far apart."""
-    return problem.mean((_angles_apart(problem, one, other) > NUMBERS.outlier_angle).double())
-
-
-def _angles_apart(problem: Problem, one: Tensor, other: Tensor) -> Tensor:
-    """``(N,)`` angles between two solutions ``(N, 4)`` after the best alignment of each component."""
-    component, count = problem.component, len(problem.roots)
-    turn = rotations.multiply(rotations.inverse(one), other)
-    moment = turn.new_zeros(count, 4, 4).index_add_(0, component, turn[:, :, None] * turn[:, None])
-    gauge = torch.linalg.eigh(moment).eigenvectors[:, :, -1]
-    return rotations.angle_between(turn, gauge[component])
+    return problem.mean(
+        (angles_after_alignment(one, other, problem.component, len(problem.roots)) > NUMBERS.outlier_angle).double()
+    )
 
 
 class Best(NamedTuple):
@@ -255,7 +247,7 @@ def settle_best(
     is_better = others.cost < own.cost
     best, worse = own.but(problem, is_better, others).begun, others.but(problem, is_better, own).begun
     ahead = problem.log_likelihood(best.body_from_world, shaped) - problem.log_likelihood(worse.body_from_world, shaped)
-    angle = _angles_apart(problem, best.body_from_world, worse.body_from_world)
+    angle = angles_after_alignment(best.body_from_world, worse.body_from_world, problem.component, len(problem.roots))
     is_doubtful = (angle > NUMBERS.outlier_angle) & (ahead < priors.rival_nats)[problem.component]
     weights = weights._replace(coarse=best.coarse)
     return Best(best.body_from_world, weights, is_doubtful if bool(is_doubtful.any()) else None)

@@ -18,14 +18,9 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from rotavg_ros.solver.algebra import quaternion_rows as rows
-from rotavg_ros.solver.algebra.pointer_jumping import (
-    doublings,
-    follow,
-    levels,
-    lowest_common_ancestors,
-    sums_of_branches,
-)
-from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, minimum_spanning_forest
+from rotavg_ros.solver.algebra.canonical_form import evenly_spread
+from rotavg_ros.solver.algebra.pointer_jumping import doublings, follow, lowest_common_ancestors, sums_of_branches
+from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root, minimum_spanning_forest
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.view_graph import ViewGraph
@@ -64,6 +59,7 @@ class Parts:
         measured: ``(4, M)`` target_from_source.
         weight: ``(M,)`` w of the cost.
         forest: the tree of each component.
+        size: ``(N,)`` number of nodes of the branch below each node, itself included.
         node: ``(P,)`` topmost node of the branch; sorted.
         edge, inside: ``(P,)`` an edge that joins the branch, and its end within the branch.
     """
@@ -73,6 +69,7 @@ class Parts:
     measured: np.ndarray
     weight: np.ndarray
     forest: SpanningForest
+    size: np.ndarray
     node: np.ndarray
     edge: np.ndarray
     inside: np.ndarray
@@ -89,11 +86,14 @@ class Parts:
         graph = graph.to("cpu")
         source, target = graph.source.numpy(), graph.target.numpy()
         measured = np.ascontiguousarray(graph.target_from_source.double().numpy().T)
-        forest = _tree(graph, source, target, angle.cpu().numpy() <= NUMBERS.outlier_angle)
         weights = weight.double().cpu().numpy()
-        used = np.flatnonzero(weights > least_weight)
-        node, edge, inside = _joining(forest, source[used], target[used])
-        return cls(source, target, measured, weights, forest, node, used[edge], inside)
+        is_used = weights > least_weight
+        forest = _tree(graph, is_used & (angle.cpu().numpy() <= NUMBERS.outlier_angle))
+        level = accumulate_to_root(forest, np.ones(graph.num_nodes)).astype(np.int64)
+        size = sums_of_branches(forest.parent, level, np.ones(graph.num_nodes))
+        used = np.flatnonzero(is_used)
+        node, edge, inside = _joining(forest, level, source[used], target[used])
+        return cls(source, target, measured, weights, forest, size, node, used[edge], inside)
 
     def turns(self, body_from_world: np.ndarray) -> Turns:
         """The best turn of each branch, given orientations ``(4, N)``."""
@@ -131,7 +131,7 @@ class Parts:
             np.minimum.at(of_edge, self.edge, turns.change[branch])
             np.minimum.at(of_branch, branch, of_edge[self.edge])
             chosen = (turns.change < 0) & (turns.change <= of_branch)
-            body_from_world, is_turned = self._turned(body_from_world, turns, chosen), True
+            body_from_world, is_turned = self.turned(body_from_world, turns, chosen), True
         return body_from_world if is_turned else None
 
     def rival(self, body_from_world: np.ndarray, priors: RefinementPriors) -> np.ndarray | None:
@@ -141,16 +141,17 @@ class Parts:
         """
         turns, component = self.turns(body_from_world), self.forest.component
         of_branch = component[turns.node]
-        share = sums_of_branches(self.forest.parent, np.ones(len(component)))[turns.node]
-        share = share / np.bincount(component)[of_branch]
+        share = self.size[turns.node] / np.bincount(component)[of_branch]
         is_part = np.minimum(share, 1 - share) > priors.rival_share
         change = np.where(is_part & (turns.change >= 0), turns.change, np.inf)
-        least = np.full(int(component.max(initial=-1)) + 1, np.inf)
+        if not bool(np.isfinite(change).any()):
+            return None
+        least = np.full(int(component.max()) + 1, np.inf)
         np.minimum.at(least, of_branch, change)
         angle = _angle(rows.residual(body_from_world, self.measured, self.source, self.target)[3])
         cost = np.bincount(component[self.source], self.weight * np.sqrt(angle), len(least))
         chosen = (change <= least[of_branch]) & (change < priors.rival_cost * cost[of_branch])
-        return self._turned(body_from_world, turns, chosen) if chosen.any() else None
+        return self.turned(body_from_world, turns, chosen) if chosen.any() else None
 
     def _stated(self, body_from_world: np.ndarray) -> np.ndarray:
         """``(4, P)`` how each edge's branch would have to turn: W with R_inside W R_outside⁻¹ = measured."""
@@ -160,7 +161,7 @@ class Parts:
         at_inside, at_outside = body_from_world[:, self.inside], body_from_world[:, outside]
         return np.asarray(rows.multiply(rows.inverse(at_inside), rows.multiply(measured, at_outside)))
 
-    def _turned(self, body_from_world: np.ndarray, turns: Turns, chosen: np.ndarray) -> np.ndarray:
+    def turned(self, body_from_world: np.ndarray, turns: Turns, chosen: np.ndarray) -> np.ndarray:
         """The orientations ``(4, N)`` after the turns of the chosen branches ``(K,)``."""
         turn = _identities(body_from_world.shape[1])
         turn[:, turns.node[chosen]] = turns.turn[:, chosen]
@@ -170,30 +171,27 @@ class Parts:
         return np.asarray(rows.normalize(rows.multiply(body_from_world, turn)))
 
 
-def _tree(graph: ViewGraph, source: np.ndarray, target: np.ndarray, fits: np.ndarray) -> SpanningForest:
-    """The forest along edges that fit and whose ends have most neighbours in common."""
-    count = np.bincount(source, minlength=graph.num_nodes)
-    # The rank of an edge among those with its source; a canonical form is sorted by source.
-    rank, of = np.arange(len(source)) - (np.cumsum(count) - count)[source], count[source]
-    is_spread = (of <= _TREE_DEGREE) | ((rank + 1) * _TREE_DEGREE // of > rank * _TREE_DEGREE // of)
-    few = np.flatnonzero(is_spread & fits)
-    ends = np.concatenate((source[few], target[few])), np.concatenate((target[few], source[few]))
+def _tree(graph: ViewGraph, fits: np.ndarray) -> SpanningForest:
+    """The forest along edges that fit ``(M,)`` and whose ends have most neighbours in common."""
+    few = evenly_spread(graph.source, graph.num_nodes, _TREE_DEGREE).numpy()
+    few = few[fits[few]]
+    source, target = graph.source.numpy()[few], graph.target.numpy()[few]
+    ends = np.concatenate((source, target)), np.concatenate((target, source))
     adjacency = csr_array((np.ones(len(ends[0]), dtype=np.int32), ends), (graph.num_nodes, graph.num_nodes))
-    common = adjacency[source[few]].multiply(adjacency[target[few]]).sum(axis=1)
+    common = adjacency[source].multiply(adjacency[target]).sum(axis=1)
     cost = np.where(fits, 2.0, 3.0)
     cost[few] = 1 / (1 + np.asarray(common).ravel())
     return minimum_spanning_forest(graph, torch.from_numpy(cost))
 
 
 def _joining(
-    forest: SpanningForest, source: np.ndarray, target: np.ndarray
+    forest: SpanningForest, level: np.ndarray, source: np.ndarray, target: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Edges that join branches with few of them: the branch's topmost node, the edge, and its end inside; sorted."""
     parent, is_root, number = forest.parent, forest.parent_edge < 0, np.arange(len(source))
-    level = levels(parent)
     meeting = lowest_common_ancestors(parent, level, source, target)
     ends = np.bincount(np.concatenate((source, target)), minlength=len(parent))
-    count = sums_of_branches(parent, ends - 2.0 * np.bincount(meeting, minlength=len(parent)))
+    count = sums_of_branches(parent, level, ends - 2.0 * np.bincount(meeting, minlength=len(parent)))
     is_few = (count <= _MOST_EDGES) & ~is_root
     # The nearest node upwards, itself included, whose branch has few; a root if there is none.
     nearest = follow(np.where(is_few | is_root, np.arange(len(parent)), parent))
