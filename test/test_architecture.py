@@ -120,7 +120,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "series": set(),
         "stated": {"noise_shape", "priors", "refinement", "step"},
         "probes": set(),
-        "uncertainty": {"priors", "probes"},
+        "uncertainty": {"laplacians", "priors", "probes"},
         "cycles": {"priors"},
         "consensus": {"cycles", "priors"},
         "starts": {"cycles", "priors", "refinement", "step"},

@@ -235,7 +235,7 @@ def write_answer(output: Path, graph_file: GraphFile, solution: Solution, summar
 
 def _orientation_columns(graph_file: GraphFile, solution: Solution) -> list[Column]:
     world_from_body, component = solution.world_from_body.cpu().numpy(), solution.component.cpu().numpy()
-    return orientation_columns(graph_file.node_ids, world_from_body, component)
+    return orientation_columns(graph_file.node_ids, world_from_body, component, solution.uncertainty.cpu().numpy())
 
 
 def _edge_columns(graph_file: GraphFile, solution: Solution) -> list[Column]:

@@ -173,7 +173,9 @@ def _write_tum(
 def _orientation_columns(answer: Answer) -> list[Column]:
     """As `rotavg solve` writes them; with several robots, the robot's number is the last column."""
     order = np.lexsort((answer.keyframe_id, answer.keyframe_robot))
-    columns = orientation_columns(keyframe_ids(answer)[order], answer.world_from_body[order], answer.component[order])
+    columns = orientation_columns(
+        keyframe_ids(answer)[order], answer.world_from_body[order], answer.component[order], answer.uncertainty[order]
+    )
     if len(answer.robots) > 1:
         columns.append(Column("robot", answer.keyframe_robot[order]))
     return columns

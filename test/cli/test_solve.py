@@ -68,13 +68,16 @@ def test_answer(graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     graph, ids = graph_file.graph, graph_file.node_ids
     solution = solve(graph)
     header, *orientations = rows(tmp_path / "out" / "orientations.csv")
-    assert header == ["id", "qx", "qy", "qz", "qw", "component"]
+    assert header == ["id", "qx", "qy", "qz", "qw", "component", "sigma_deg"]
     assert [int(row[0]) for row in orientations] == ids.tolist() == sorted(ids)
     world_from_body = torch.tensor([[float(cell) for cell in row[1:5]] for row in orientations], dtype=torch.float64)
     assert (world_from_body[:, 3] >= 0).all()
     expected = rotations.inverse(solution.body_from_world)
     assert rotations.angle_between(world_from_body, expected).max() < 1e-9
     assert [int(row[5]) for row in orientations] == solution.component.tolist()
+    sigma_deg = [float(row[6]) for row in orientations]
+    np.testing.assert_allclose(sigma_deg, torch.rad2deg(solution.uncertainty), atol=1e-4)
+    assert sigma_deg[0] == 0 and min(sigma_deg[1:]) > 0
 
     header, *edges = rows(tmp_path / "out" / "edges.csv")
     assert header == ["source", "target", "outlier_score", "outlier"]

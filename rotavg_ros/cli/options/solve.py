@@ -2,7 +2,7 @@
 
 Reads g2o, TORO, iSAM, 1DSfM EGs.txt (gzipped, too), npz and Lund's .mat.
 Writes to DIR, or to DIR/<stem> for several graphs:
-  orientations.csv  id,qx,qy,qz,qw,component   world_from_body, ascending by id
+  orientations.csv  id,qx,qy,qz,qw,component,sigma_deg   world_from_body, ascending by id
   edges.csv         source,target,outlier_score,outlier   in the order of the file (or edges.npz)
   summary.json      counts, warnings, seconds, memory, device, method, version
 """

@@ -25,10 +25,19 @@ class Column(NamedTuple):
     decimals: int = 0
 
 
-def orientation_columns(ids: np.ndarray, world_from_body: np.ndarray, component: np.ndarray) -> list[Column]:
-    """Columns of ``orientations.csv``: ``(N,)`` ids, ``(N, 4)`` xyzw and ``(N,)`` components."""
+def orientation_columns(
+    ids: np.ndarray, world_from_body: np.ndarray, component: np.ndarray, uncertainty: np.ndarray
+) -> list[Column]:
+    """Columns of ``orientations.csv``.
+
+    Args:
+        ids, component: ``(N,)``.
+        world_from_body: ``(N, 4)`` xyzw.
+        uncertainty: ``(N,)`` rad, standard deviation of each component of an orientation's error; NaN unknown.
+    """
+    sigma_deg = np.degrees(np.where(np.isfinite(uncertainty), uncertainty, np.nan))
     quaternion = [Column(name, world_from_body[:, i], decimals=12) for i, name in enumerate(("qx", "qy", "qz", "qw"))]
-    return [Column("id", ids), *quaternion, Column("component", component)]
+    return [Column("id", ids), *quaternion, Column("component", component), Column("sigma_deg", sigma_deg, decimals=4)]
 
 
 def edge_columns(

@@ -1,4 +1,4 @@
-"""Random signs that tell variances from a few right-hand sides (see ``FactorisedLaplacian.samples``)."""
+"""Random signs that tell variances from a few right-hand sides (``uncertainty.py``)."""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
 """Uncertainty of refined orientations, relative to one node of each component.
 
 It is the least-squares covariance σ² L⁻¹ of the believed edges: each is weighted by the probability that it is no
-outlier, and σ² is the sum of squared residuals over the number of redundant edges. Its diagonal is estimated from
-random samples (:meth:`~rotavg_ros.solver.algebra.sparse.laplacian.FactorisedLaplacian.samples`). Noise is assumed
-round. A factorisation takes too long where a graph is well knit.
+outlier, and σ² is the sum of squared residuals over the number of redundant edges. Noise is assumed round. Its diagonal
+is estimated from random samples of the answer. What a node's own edges contribute is known without any samples, and
+where nodes have many edges that is nearly all; there the samples come from conjugate gradients, without a
+factorisation.
 """
 
 from __future__ import annotations
@@ -15,14 +16,18 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem
+from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
+from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem, incidence_matrix
+from rotavg_ros.solver.sfm.laplacians.scalar import ScalarLaplacian
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.probes import probe_signs
 from rotavg_ros.view_graph import ViewGraph
 
 _WELL_KNIT_DEGREE = RefinementPriors().well_knit_degree
-# Sampled standard deviations err by 9 %.
+# What is sampled of a standard deviation errs by 9 %.
 _SAMPLES = 64
+# With more edges, the samples would take seconds.
+_MOST_EDGES = 1_000_000
 # Weight of edges that are surely wrong, which keeps the graph connected.
 _LEAST_WEIGHT = 1e-3
 _FLAGGED = 0.5
@@ -42,10 +47,26 @@ class References(NamedTuple):
     node: Tensor
 
 
+class _Samples(NamedTuple):
+    """Random node values ``(N, k)`` whose second moments are L⁻¹.
+
+    Spielman & Srivastava (2008): mean squared differences of such values estimate effective resistances, that is
+    variances of estimated differences, with a relative error of √(2/k).
+
+    Attributes:
+        force: ``(N, k)`` L times the values.
+        value: ``(N, k)`` up to a constant in every component.
+    """
+
+    force: Tensor
+    value: Tensor
+
+
 def variances(graph: ViewGraph, angle: Tensor, score: Tensor, bridge: Tensor, to: References) -> Tensor | None:
     """Variance ``(N,)`` rad² of each component of a node's error relative to its component's reference.
 
-    NaN in components that are well knit, and in trees, where nothing checks anything; None if there are no others.
+    NaN in trees, where nothing checks anything, and in well-knit components of graphs with more than a million edges;
+    None if there are no others.
 
     Args:
         angle: ``(M,)`` rad, residuals.
@@ -56,47 +77,91 @@ def variances(graph: ViewGraph, angle: Tensor, score: Tensor, bridge: Tensor, to
     count = len(to.node)
     size = torch.bincount(to.component, minlength=count)
     edges = torch.bincount(to.component[graph.source], minlength=count)
-    is_loose = (2 * edges < _WELL_KNIT_DEGREE * size) & (edges >= size)
-    if not bool(is_loose.any()):
-        return None
-    loose = is_loose[to.component]
-    kept = loose[graph.source].nonzero().squeeze(1)
-    weight = (1 - score[kept]).clamp(min=_LEAST_WEIGHT)
-    source, target = graph.source[kept], graph.target[kept]
+    is_checked, is_loose = edges >= size, 2 * edges < _WELL_KNIT_DEGREE * size
+    weight = (1 - score).clamp(min=_LEAST_WEIGHT)
 
     def sums(value: Tensor) -> Tensor:
-        return value.new_zeros(count).index_add_(0, to.component[source], value)
+        return value.new_zeros(count).index_add_(0, to.component[graph.source], value)
 
     # Number of believed edges beyond a spanning tree, at least one.
-    checks = (sums((score[kept] < _FLAGGED).to(weight)) - size + 1).clamp(min=1)
-    noise = sums(weight * angle[kept].to(weight).square()) / (3 * checks)
+    checks = (sums((score < _FLAGGED).to(weight)) - size + 1).clamp(min=1)
+    noise = sums(weight * angle.to(weight).square()) / (3 * checks)
     turned = torch.zeros_like(score)
     turned[bridge] = score[bridge] * rotations.RANDOM_VARIANCE
-    turned = turned[kept] / noise[to.component[source]].clamp(min=_LEAST_NOISE)
-    weight = 1 / (1 / weight + turned)
+    weight = 1 / (1 / weight + turned / noise[to.component[graph.source]].clamp(min=_LEAST_NOISE))
+    found = weight.new_full((graph.num_nodes,), torch.nan)
+    for chosen, sample in ((is_checked & is_loose, _by_factorisation), (is_checked & ~is_loose, _by_iterations)):
+        nodes = chosen[to.component]
+        edges_of = nodes[graph.source].nonzero().squeeze(1)
+        if not len(edges_of):
+            continue
+        part, of_part = graph.select_edges(edges_of), weight[edges_of]
+        samples = sample(part, of_part, to)
+        if samples is not None:
+            found = torch.where(nodes, noise[to.component] * _relative(part, of_part, samples, to), found)
+    return None if bool(found.isnan().all()) else found
+
+
+def _relative(graph: ViewGraph, weight: Tensor, samples: _Samples, to: References) -> Tensor:
+    """Variances ``(N,)`` of nodes less their component's reference, in units of σ²; of nodes that have edges.
+
+    With L x = f and D its diagonal, x = f / D + y, where y are the means of the neighbours' x. Since E f xᵀ = 1 up to a
+    constant, and E f fᵀ = L, of E (xᵥ − xᵣ)² all is known but E (yᵥ − yᵣ)².
+    """
+    reference = to.node[to.component]
+    degree, beside_reference = weight.new_zeros(2, graph.num_nodes).unbind()
+    for one, other in ((graph.source, graph.target), (graph.target, graph.source)):
+        degree.index_add_(0, one, weight)
+        beside_reference.index_add_(0, one, torch.where(other == reference[other], weight, 0.0))
+    of_others = samples.value - samples.force / degree[:, None]
+    variance = (of_others - of_others[reference]).square().mean(dim=1)
+    variance += 1 / degree + 1 / degree[reference] - 2 * beside_reference / (degree * degree[reference])
+    return variance.index_fill(0, to.node, 0.0)
+
+
+def _by_factorisation(graph: ViewGraph, weight: Tensor, to: References) -> _Samples:
+    """Samples for the nodes that have edges, in loosely knit components."""
+    is_used = torch.zeros(graph.num_nodes, dtype=torch.bool, device=graph.device)
+    is_used[graph.source] = is_used[graph.target] = True
     # Nodes whose variance is not needed are held fixed, like the references.
-    fixed = ~loose
+    fixed = ~is_used
     fixed[to.node] = True
-    ends = source.cpu().numpy(), target.cpu().numpy()
+    ends = graph.source.cpu().numpy(), graph.target.cpu().numpy()
     system = LaplacianSystem(graph.num_nodes, *ends, weight.cpu().numpy(), fixed.nonzero().squeeze(1).cpu().numpy())
-    signs = _signs(*ends, to.component[source].cpu().numpy(), _first_nodes(to.component, count))
-    samples = torch.from_numpy(system.samples(signs)).to(weight)
-    difference = samples - samples[to.node][to.component]
-    return torch.where(loose, noise[to.component] * difference.square().mean(dim=1), torch.nan)
+    force = _forces(graph, weight, to)
+    return _Samples(force, torch.from_numpy(system.solve(force.cpu().numpy())).to(force))
 
 
-def _first_nodes(component: Tensor, count: int) -> np.ndarray:
-    """``(C,)`` of every component."""
-    nodes = torch.arange(len(component), device=component.device)
-    first = nodes.new_full((count,), len(component)).scatter_reduce(0, component, nodes, "amin")
-    return np.asarray(first.cpu().numpy())
+def _by_iterations(graph: ViewGraph, weight: Tensor, to: References) -> _Samples | None:
+    """Samples for the nodes that have edges, in well-knit components; None if the iterations do not converge."""
+    if graph.num_edges > _MOST_EDGES:
+        return None
+    weight = weight.float()
+    force = _forces(graph, weight, to)
+    value, is_solved = ScalarLaplacian(SortedEdges.of(graph), weight, to.component).solve(force.t().contiguous())
+    return _Samples(force.double(), value.t().double()) if is_solved else None
 
 
-def _signs(source: np.ndarray, target: np.ndarray, component: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Random signs ``(M, samples)`` of edges, for each component as if it were alone."""
+def _forces(graph: ViewGraph, weight: Tensor, to: References) -> Tensor:
+    """Random forces ``(N, k)`` on nodes whose second moments are L: Bᵀ W^½ times random signs."""
+    ends = graph.source.cpu().numpy(), graph.target.cpu().numpy()
+    root = weight.sqrt().cpu().numpy()
+    incidence = incidence_matrix(graph.num_nodes, *ends).astype(root.dtype)
+    signs = _signs(*ends, to)
+    # A few columns at a time: as floating-point numbers, all of them would take much memory.
+    parts = [incidence @ (root[:, None] * few) for few in np.array_split(signs, range(8, _SAMPLES, 8), axis=1)]
+    return torch.from_numpy(np.concatenate(parts, axis=1)).to(weight)
+
+
+def _signs(source: np.ndarray, target: np.ndarray, to: References) -> np.ndarray:
+    """Random signs ``(M, k)`` of edges, for each component as if it were alone."""
+    component = to.component.cpu().numpy()
+    first = np.full(len(to.node), len(component))
+    np.minimum.at(first, component, np.arange(len(component)))
+    of_edge = component[source]
     signs = np.empty((len(source), _SAMPLES), dtype=np.int8)
-    order = np.argsort(component, kind="stable")
-    for members in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
-        start = first[component[members[0]]]
+    order = np.argsort(of_edge, kind="stable")
+    for members in np.split(order, np.flatnonzero(np.diff(of_edge[order])) + 1):
+        start = first[of_edge[members[0]]]
         signs[members] = probe_signs(source[members] - start, target[members] - start, _SAMPLES)
     return signs

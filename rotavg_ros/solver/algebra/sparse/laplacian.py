@@ -32,7 +32,6 @@ _DENSE_MAX_NODES = 5000
 # which costs more than it saves: 48 columns on 8600 nodes took 180 ms of CPU time at once and 28 ms in fours.
 # Six columns stay on one thread only in smaller graphs: ticks of 10 000 keyframes took twice the CPU time with six.
 _COLUMNS_AT_ONCE = 4
-_ENTRIES_AT_ONCE = 100_000
 
 
 def incidence_matrix(num_nodes: int, source: np.ndarray, target: np.ndarray) -> csr_array:
@@ -152,18 +151,6 @@ class FactorisedLaplacian:
     def fit(self, difference: np.ndarray) -> np.ndarray:
         """Node values ``(N, k)`` whose differences target − source fit ``difference`` ``(E, k)`` best."""
         return self.solve(self.incidence_sum(self.weight[:, None] * difference))
-
-    def samples(self, signs: np.ndarray) -> np.ndarray:
-        """Node values ``(N, k)`` whose second moments are ``L⁻¹``, from independent signs ±1 ``(E, k)``.
-
-        Spielman & Srivastava (2008): mean squared differences of such samples estimate effective resistances, that is
-        variances of estimated differences, with a relative error of √(2/k).
-        """
-        root = np.sqrt(self.weight)[:, None]
-        # In a large graph, only a few columns at a time stay in a core's cache from the signs to the solution.
-        count = max(_COLUMNS_AT_ONCE, _ENTRIES_AT_ONCE // max(len(root), 1))
-        columns = (signs[:, start : start + count] for start in range(0, signs.shape[1], count))
-        return np.concatenate([self.solve(self.incidence_sum(root * few)) for few in columns], axis=1)
 
 
 class LaplacianSystem(FactorisedLaplacian):

@@ -26,7 +26,7 @@ from rotavg_ros.solver.running.threads import for_each, slices, threads_on
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape
 from rotavg_ros.view_graph import ViewGraph
 
-_MAX_ITERATIONS = 300
+MAX_ITERATIONS = 300
 # With fewer edges a product takes less time than waking another worker.
 _WORTH_WORKERS = 50_000
 Preconditioner = Callable[[Tensor], Tensor]
@@ -98,7 +98,7 @@ class Laplacian(ABC):
     """
 
     def __init__(self, diagonal: Tensor, weight_sum: Tensor, component: Tensor) -> None:
-        self._components = _Components(component, int(component.max()) + 1)
+        self._components = Components(component, int(component.max()) + 1)
         self._diagonal, self.weight_sum = diagonal, weight_sum
 
     @abstractmethod
@@ -129,7 +129,7 @@ class Laplacian(ABC):
             tolerance: largest entry of the preconditioned residual, in the unknowns' unit.
             relative_tolerance: the same as a share of what it is at zero; the larger of the two counts.
         """
-        stop = Stop(tolerance, relative_tolerance, _MAX_ITERATIONS)
+        stop = Stop(tolerance, relative_tolerance, MAX_ITERATIONS)
         return conjugate_gradients(self.product, precondition, force, self._components, stop)
 
 
@@ -177,8 +177,8 @@ class BlockLaplacian(Laplacian):
         return self.at_nodes(x).sub_(parts[0]).sub_(parts[1])
 
 
-class _Components:
-    """The components of a graph, each a system by itself; vectors are ``(3, N)``.
+class Components:
+    """The components of a graph, each a system by itself; vectors are ``(k, N)``.
 
     Args:
         component: ``(N,)``.

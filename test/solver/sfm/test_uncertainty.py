@@ -1,0 +1,97 @@
+"""What SfM answers state of their errors, against errors over draws of the noise and against the exact inverse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros import ViewGraph, rotations, solve
+from rotavg_ros.solver.sfm import uncertainty
+from test.solver.graphs import as_quaternions, measured, random_truth, small_noise
+
+
+def _street(num_nodes: int, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Each camera sees the next two."""
+    node = np.repeat(np.arange(num_nodes - 2), 2)
+    return first + node, first + node + np.tile([1, 2], num_nodes - 2)
+
+
+def _dense(num_nodes: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """A ring, and pairs at random; about ``degree`` edges a node."""
+    rng = np.random.default_rng(3)
+    source, target = np.triu_indices(num_nodes, k=1)
+    kept = (rng.random(len(source)) < degree / num_nodes) | (target == source + 1)
+    return source[kept], target[kept]
+
+
+_GRAPHS = {"street": _street(60), "well knit": _dense(60, 20)}
+
+
+def _exact(graph: ViewGraph, weight: np.ndarray) -> np.ndarray:
+    """Diagonal of the inverse Laplacian without the first node, ``(N - 1,)``."""
+    laplacian = np.zeros((graph.num_nodes, graph.num_nodes))
+    for source, target, value in zip(graph.source.tolist(), graph.target.tolist(), weight, strict=True):
+        laplacian[[source, target], [source, target]] += value
+        laplacian[[source, target], [target, source]] -= value
+    return np.diag(np.linalg.inv(laplacian[1:, 1:]))
+
+
+@pytest.mark.parametrize("name", _GRAPHS)
+def test_it_is_the_diagonal_of_the_least_squares_covariance(name: str) -> None:
+    rng = np.random.default_rng(1)
+    source, target = _GRAPHS[name]
+    graph = measured(random_truth(60, 1), source, target)
+    score = torch.from_numpy(rng.uniform(0, 0.9, len(source)))
+    angle = torch.from_numpy(rng.uniform(0.01, 0.05, len(source)))
+    to = uncertainty.References(torch.zeros(60, dtype=torch.int64), torch.tensor([0]))
+    found = uncertainty.variances(graph, angle, score, torch.zeros(0, dtype=torch.int64), to)
+    assert found is not None and float(found[0]) == 0
+    weight = 1 - score.numpy()
+    noise = float((weight * angle.numpy() ** 2).sum()) / (3 * (int((score < 0.5).sum()) - 59))
+    ratio = (found.numpy()[1:] / (noise * _exact(graph, weight))) ** 0.5
+    assert np.allclose(ratio, 1, atol=0.3 if name == "street" else 0.03)
+
+
+@pytest.mark.parametrize("name", _GRAPHS)
+def test_errors_over_draws_of_the_noise_are_as_stated(name: str) -> None:
+    source, target = _GRAPHS[name]
+    truth = random_truth(60, 5)
+    root = as_quaternions(truth * truth[0].inv())
+    squares, stated = [], []
+    for seed in range(12):
+        graph = measured(truth, source, target, small_noise(len(source), 3.0, seed))
+        solution = solve(graph, profile="sfm")
+        error = rotations.log(rotations.multiply(rotations.inverse(root), solution.body_from_world))
+        squares.append((error**2).mean(dim=1))
+        stated.append(solution.uncertainty**2)
+    assert float(stated[0][0]) == 0
+    ratio = (torch.stack(squares).mean(0)[1:] / torch.stack(stated).mean(0)[1:]).sqrt()
+    assert 0.7 < float(ratio.median()) < 1.4
+
+
+def test_each_component_states_its_own() -> None:
+    """A well-knit one, a street and a tree state what they state alone."""
+    dense, tree = _dense(40, 20), (100 + np.arange(8), 101 + np.arange(8))
+    source, target = np.concatenate((dense, _street(60, 40), tree), axis=1)
+    together = measured(random_truth(109, 6), source, target, small_noise(len(source), 1.0, 6))
+    stated = solve(together, profile="sfm").uncertainty
+    assert bool(stated[100:].isnan().all())
+    for nodes in (slice(0, 40), slice(40, 100)):
+        chosen = (together.source >= nodes.start) & (together.source < nodes.stop)
+        part = together.select_edges(chosen.nonzero()[:, 0])
+        ends = part.source - nodes.start, part.target - nodes.start
+        alone = ViewGraph.create(*ends, part.target_from_source, num_nodes=nodes.stop - nodes.start)
+        assert torch.allclose(stated[nodes], solve(alone, profile="sfm").uncertainty, rtol=0.02)
+
+
+def test_well_knit_graphs_with_too_many_edges_state_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = measured(random_truth(60, 7), *_GRAPHS["well knit"])
+    assert bool(solve(graph, profile="sfm").uncertainty.isfinite().all())
+    monkeypatch.setattr(uncertainty, "_MOST_EDGES", 100)
+    assert bool(solve(graph, profile="sfm").uncertainty.isnan().all())
+
+
+def test_a_tree_states_none() -> None:
+    tree = measured(random_truth(9, 8), np.arange(8), np.arange(8) + 1)
+    assert bool(solve(tree, profile="sfm").uncertainty.isnan().all())
