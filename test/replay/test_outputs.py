@@ -87,7 +87,7 @@ def test_the_graph_loads_in_gtsam_and_is_near_its_own_least_squares(run: Simulat
 
 def test_tables_are_like_those_of_solve(run: SimulatedRun, replayed: Path) -> None:
     orientations, edges = read_csv(replayed / "orientations.csv"), read_csv(replayed / "edges.csv")
-    assert list(orientations) == ["id", "qx", "qy", "qz", "qw", "component"]
+    assert list(orientations) == ["id", "qx", "qy", "qz", "qw", "component", "sigma_deg"]
     judged = ["rotation_score", "residual_deg", "residual_m"]
     assert list(edges) == ["source", "target", "outlier_score", "outlier", *judged, "edge_id"]
     with BagReader(replayed / "run.mcap") as recording:

@@ -185,6 +185,30 @@ class DensityPriors:
 
 
 @dataclass(frozen=True)
+class StartPriors:
+    """Where the refinement begins besides CleanNet, tree and FineNet (``starts/``).
+
+    Attributes:
+        sparse_degree: with fewer edges per node, all starts are tried on all edges; with more, one start is, on
+            this many edges per node.
+        part_edges: branches that more edges join to the rest are not turned: a few false edges do not hold them in a
+            wrong place.
+        tree_degree: maximum number of edges per source along which the tree of branches is built, where they suffice
+            to connect the graph.
+        turned_rounds: maximum number of rounds in which branches are turned, each after the turns of those before.
+        rounds: maximum number of times that the best solution's parts are turned and refined.
+        most_searched: in graphs with more edges parts are not searched; it would take seconds.
+    """
+
+    sparse_degree: int = 40
+    part_edges: int = 32
+    tree_degree: int = 20
+    turned_rounds: int = 5
+    rounds: int = 3
+    most_searched: int = 1_000_000
+
+
+@dataclass(frozen=True)
 class RefinementPriors:
     """How the refinement weighs edges and when it ends (``refinement.py``).
 
@@ -235,6 +259,7 @@ class RefinementPriors:
             recipes, which have thousands of edges, do not depend on it.
         shape: how the noise's shape is estimated.
         density: which density the last steps use.
+        starts: where the refinement begins.
     """
 
     max_steps: int = 50
@@ -264,3 +289,4 @@ class RefinementPriors:
     half_trusted: float = 20.0
     shape: NoiseShapePriors = NoiseShapePriors()
     density: DensityPriors = DensityPriors()
+    starts: StartPriors = StartPriors()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -51,7 +53,7 @@ def wrong(truth: Rotation) -> Rotation:
 def parts_at(graph: ViewGraph, at: Rotation) -> tuple[Parts, np.ndarray]:
     angle = EdgeResiduals(graph, as_quaternions(at)).angles()
     weight = torch.ones(graph.num_edges, dtype=torch.float64)
-    return Parts.of(graph, angle, weight, 1e-3), np.ascontiguousarray(at.as_quat().T)
+    return Parts.of(graph, angle, weight, PRIORS), np.ascontiguousarray(at.as_quat().T)
 
 
 def cost(graph: ViewGraph, at: Rotation) -> float:
@@ -65,12 +67,12 @@ def test_a_part_that_false_edges_hold_is_turned_back(seed: int) -> None:
     graph, truth = halves(seed, good=5, false=3)
     start = wrong(truth)
     parts, rows = parts_at(graph, start)
-    found = parts.improved(rows)
+    found = parts.improved(rows, PRIORS)
     assert found is not None
     errors = orientation_errors(torch.from_numpy(found.T.copy()), as_quaternions(truth))
     assert float(torch.rad2deg(errors).mean()) < 3.0  # one edge tells, with its own noise
     assert cost(graph, Rotation.from_quat(found.T)) < cost(graph, start)
-    assert parts_at(graph, truth)[0].improved(parts_at(graph, truth)[1]) is None
+    assert parts_at(graph, truth)[0].improved(parts_at(graph, truth)[1], PRIORS) is None
 
 
 def test_the_change_of_each_turn_is_that_of_the_whole_cost() -> None:
@@ -104,6 +106,14 @@ def test_both_ways_are_refined_where_as_many_edges_say_either(is_wrong: bool) ->
     assert bool(best.is_doubtful.all())
 
 
+def test_graphs_with_too_many_edges_are_not_searched() -> None:
+    graph, truth = halves(0, good=3, false=3)
+    ones = torch.ones(graph.num_edges, dtype=torch.float64)
+    structure, start = Structure.of(graph), Start(as_quaternions(truth), ones)
+    few = replace(PRIORS, starts=replace(PRIORS.starts, most_searched=graph.num_edges - 1))
+    assert begin(graph, [start, start], ones, structure, few).rival is None
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_where_as_many_edges_say_either_the_answer_says_so(seed: int) -> None:
     """Which of the two is right nobody can tell."""
@@ -133,5 +143,5 @@ def test_there_is_nothing_to_turn_in_a_graph_that_is_joined_well_or_hardly_at_al
         measured = truth[target] * truth[source].inv() if len(source) else Rotation.identity(0)
         graph = ViewGraph.create(source, target, measured.as_quat().reshape(-1, 4), num_nodes=50)
         parts, rows = parts_at(graph, truth)
-        assert parts.improved(rows) is None
+        assert parts.improved(rows, PRIORS) is None
         assert parts.rival(rows, PRIORS) is None

@@ -23,11 +23,6 @@ from rotavg_ros.solver.sfm.starts.parts import Parts
 from rotavg_ros.solver.sfm.step import Problem, Structure
 from rotavg_ros.view_graph import ViewGraph
 
-# Maximum number of times that parts of the best solution are turned.
-_ROUNDS = 3
-# With more edges, looking for such parts would take seconds.
-_MOST_EDGES = 1_000_000
-
 
 class Start(NamedTuple):
     """Where a refinement may begin.
@@ -79,7 +74,7 @@ def begin(
     search = _Search(problem, shaped, [first], first)
     for start in starts[1:]:
         search.add(start)
-    for _ in range(_ROUNDS if len(starts) > 1 else 0):
+    for _ in range(priors.starts.rounds if len(starts) > 1 else 0):
         has_gained = [search.add(start) for start in search.turned()]
         if not any(has_gained):
             break
@@ -116,14 +111,14 @@ class _Search:
 
     def turned(self) -> list[Start]:
         """Starts in which parts of the best solution are turned."""
-        problem, known = self.problem, self.best.begun.body_from_world
-        if problem.graph.num_edges > _MOST_EDGES:
+        problem, priors, known = self.problem, self.problem.priors, self.best.begun.body_from_world
+        if problem.graph.num_edges > priors.starts.most_searched:
             return []
         angle = EdgeResiduals(problem.graph, known.float()).angles()
-        parts = Parts.of(problem.graph, angle, self.shaped, problem.priors.density.least_prior)
+        parts = Parts.of(problem.graph, angle, self.shaped, priors)
         at = np.ascontiguousarray(known.cpu().numpy().T)
-        better = parts.improved(at)
-        rival = parts.rival(at if better is None else better, problem.priors)
+        better = parts.improved(at, priors)
+        rival = parts.rival(at if better is None else better, priors)
         turned = (torch.from_numpy(np.ascontiguousarray(one.T)) for one in (better, rival) if one is not None)
         return [Start(one.to(known), self.shaped) for one in turned]
 

@@ -20,15 +20,12 @@ from rotavg_ros.solver.sfm.starts.spectral import spectral
 from rotavg_ros.solver.sfm.step import Problem, Structure
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-# If cameras have fewer edges on average, other starts cost little and need all of the edges.
-_SPARSE_DEGREE = 40
-
 
 def is_sparse(graph: ViewGraph, component: Tensor) -> Tensor:
     """Components in which cameras have few edges on average, ``(C,)`` bool, given the components ``(N,)`` of nodes."""
     nodes = torch.bincount(component)
     edges = torch.bincount(component.index_select(0, graph.source), minlength=len(nodes))
-    return 2 * edges < _SPARSE_DEGREE * nodes
+    return 2 * edges < PRIORS.starts.sparse_degree * nodes
 
 
 def other_starts(judged: Cleaned, is_believed: bool, parent_edge: Tensor, component: Tensor) -> list[Start]:
@@ -67,12 +64,12 @@ def _by_all_alike(graph: ViewGraph, component: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _part(graph: ViewGraph, parent_edge: Tensor) -> Tensor:
-    """Indices of edges, at most half of :data:`_SPARSE_DEGREE` per source, evenly spread, and those of the forest."""
+    """Indices of edges, at most half of ``sparse_degree`` per source, evenly spread, and those of the forest."""
     number = torch.arange(graph.num_edges, device=graph.device)
     count = torch.bincount(graph.source, minlength=graph.num_nodes)
     # The rank of an edge among those with its source; a canonical form is sorted by source.
     rank = number - (count.cumsum(0) - count)[graph.source]
-    most, of = _SPARSE_DEGREE // 2, count[graph.source]
+    most, of = PRIORS.starts.sparse_degree // 2, count[graph.source]
     is_chosen = (rank + 1) * most // of > rank * most // of
     is_chosen |= of <= most
     is_chosen[parent_edge[parent_edge >= 0]] = True

@@ -25,14 +25,8 @@ from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.view_graph import ViewGraph
 
-# A branch that more edges join to the rest is not held in a wrong place by a few false ones.
-_MOST_EDGES = 32
-# Maximum number of edges per source along which the tree is built, where they suffice to connect the graph.
-_TREE_DEGREE = 20
 # Number of pairs of statements that are compared at a time; bounds the memory.
 _AT_A_TIME = 1 << 20
-# Maximum number of rounds in which branches are turned, each after the turns of those before.
-_ROUNDS = 5
 
 
 @dataclass(frozen=True)
@@ -75,24 +69,23 @@ class Parts:
     inside: np.ndarray
 
     @classmethod
-    def of(cls, graph: ViewGraph, angle: Tensor, weight: Tensor, least_weight: float) -> Parts:
+    def of(cls, graph: ViewGraph, angle: Tensor, weight: Tensor, priors: RefinementPriors) -> Parts:
         """The parts, given residuals of orientations in which most edges fit.
 
         Args:
             angle: ``(M,)`` rad, residuals.
-            weight: ``(M,)`` w of the cost.
-            least_weight: edges of less weight join nothing.
+            weight: ``(M,)`` w of the cost; edges of hardly any join nothing.
         """
         graph = graph.to("cpu")
         source, target = graph.source.numpy(), graph.target.numpy()
         measured = np.ascontiguousarray(graph.target_from_source.double().numpy().T)
         weights = weight.double().cpu().numpy()
-        is_used = weights > least_weight
-        forest = _tree(graph, is_used & (angle.cpu().numpy() <= NUMBERS.outlier_angle))
+        is_used = weights > priors.density.least_prior
+        forest = _tree(graph, is_used & (angle.cpu().numpy() <= NUMBERS.outlier_angle), priors.starts.tree_degree)
         level = accumulate_to_root(forest, np.ones(graph.num_nodes)).astype(np.int64)
         size = sums_of_branches(forest.parent, level, np.ones(graph.num_nodes))
         used = np.flatnonzero(is_used)
-        node, edge, inside = _joining(forest, level, source[used], target[used])
+        node, edge, inside = _joining(forest, level, source[used], target[used], priors.starts.part_edges)
         return cls(source, target, measured, weights, forest, size, node, used[edge], inside)
 
     def turns(self, body_from_world: np.ndarray) -> Turns:
@@ -118,10 +111,10 @@ class Parts:
         turn[:, at] = stated[:, tries[chosen]]
         return Turns(node, change, turn)
 
-    def improved(self, body_from_world: np.ndarray) -> np.ndarray | None:
+    def improved(self, body_from_world: np.ndarray, priors: RefinementPriors) -> np.ndarray | None:
         """The orientations ``(4, N)`` after turns that lower the cost; None if none does."""
         is_turned = False
-        for _ in range(_ROUNDS):
+        for _ in range(priors.starts.turned_rounds):
             turns = self.turns(body_from_world)
             if not bool((turns.change < 0).any()):
                 break
@@ -171,9 +164,9 @@ class Parts:
         return np.asarray(rows.normalize(rows.multiply(body_from_world, turn)))
 
 
-def _tree(graph: ViewGraph, fits: np.ndarray) -> SpanningForest:
-    """The forest along edges that fit ``(M,)`` and whose ends have most neighbours in common."""
-    few = evenly_spread(graph.source, graph.num_nodes, _TREE_DEGREE).numpy()
+def _tree(graph: ViewGraph, fits: np.ndarray, degree: int) -> SpanningForest:
+    """The forest along edges that fit ``(M,)`` and whose ends have most neighbours in common; ``degree`` per source."""
+    few = evenly_spread(graph.source, graph.num_nodes, degree).numpy()
     few = few[fits[few]]
     source, target = graph.source.numpy()[few], graph.target.numpy()[few]
     ends = np.concatenate((source, target)), np.concatenate((target, source))
@@ -185,14 +178,18 @@ def _tree(graph: ViewGraph, fits: np.ndarray) -> SpanningForest:
 
 
 def _joining(
-    forest: SpanningForest, level: np.ndarray, source: np.ndarray, target: np.ndarray
+    forest: SpanningForest, level: np.ndarray, source: np.ndarray, target: np.ndarray, most_edges: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges that join branches with few of them: the branch's topmost node, the edge, and its end inside; sorted."""
+    """Edges that join branches with at most ``most_edges`` of them; sorted.
+
+    Returns:
+        The branch's topmost node, the edge, and the edge's end inside, ``(P,)`` each.
+    """
     parent, is_root, number = forest.parent, forest.parent_edge < 0, np.arange(len(source))
     meeting = lowest_common_ancestors(parent, level, source, target)
     ends = np.bincount(np.concatenate((source, target)), minlength=len(parent))
     count = sums_of_branches(parent, level, ends - 2.0 * np.bincount(meeting, minlength=len(parent)))
-    is_few = (count <= _MOST_EDGES) & ~is_root
+    is_few = (count <= most_edges) & ~is_root
     # The nearest node upwards, itself included, whose branch has few; a root if there is none.
     nearest = follow(np.where(is_few | is_root, np.arange(len(parent)), parent))
     found = [(number[:0], number[:0], number[:0])]
