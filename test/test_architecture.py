@@ -119,14 +119,13 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "step": {"laplacians", "noise_density", "noise_shape", "priors", "series", "symmetric_rows"},
         "series": set(),
         "stated": {"noise_shape", "priors", "refinement", "step"},
-        "probes": set(),
-        "uncertainty": {"laplacians", "priors", "probes"},
         "cycles": {"priors"},
         "consensus": {"cycles", "priors"},
         "starts": {"cycles", "priors", "refinement", "step"},
+        "certainty": {"laplacians", "priors", "starts"},
         "solve": {
-            *("consensus", "cycles", "options", "refinement", "series", "starts", "stated"),
-            *("step", "uncertainty"),
+            *("certainty", "consensus", "cycles", "options", "refinement", "series", "starts", "stated"),
+            "step",
         },
     },
     "solver/slam": {

@@ -34,7 +34,7 @@ def _forget(traffic: Traffic) -> None:
         record.clear()
 
 
-@pytest.mark.parametrize(("method", "waits"), [("neurora", 296), ("neurora-v2", 59), ("neurora-round", 297)])
+@pytest.mark.parametrize(("method", "waits"), [("neurora", 300), ("neurora-v2", 59), ("neurora-round", 301)])
 def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> None:
     graph = _graph()
     with pretended_gpu() as traffic:
@@ -50,6 +50,9 @@ def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> Non
     if method != "neurora-v2":
         # Parts that few edges join are looked for on the CPU: in the graph, given its residuals, weights and an answer.
         from_gpu += [(edges,)] * 8 + [(edges, 4), (nodes, 4)]
+        # So is how surely they are attached: from the answer, residuals and scores, with shares of one component.
+        from_gpu += [(nodes, 4), (nodes,)] + [(edges,)] * 4 + [(1,)] * 2
+        to_gpu += [(edges,), (nodes,)]
         # Samples of the uncertainty are drawn there, given edges' ends and weights, and nodes' components.
         from_gpu += [(edges,)] * 3 + [(nodes,)]
         to_gpu += [(nodes, 64)]

@@ -37,6 +37,11 @@ def normalize(a: np.ndarray) -> np.ndarray:
     return np.asarray(a / np.sqrt(np.einsum("in,in->n", a, a)))
 
 
+def angle(cosine: np.ndarray) -> np.ndarray:
+    """Angles in rad of rotations whose quaternions have this w, of either sign."""
+    return np.asarray(2 * np.arccos(np.minimum(np.abs(cosine), 1.0)))
+
+
 def log(a: np.ndarray) -> np.ndarray:
     """Unit quaternions of either sign → rotation vectors ``(3, n)`` in radians, of length at most π."""
     vector = a[:3]

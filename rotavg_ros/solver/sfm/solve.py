@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,6 +23,8 @@ from rotavg_ros.solver.neurora.scores import residual_and_uncertainty, residual_
 from rotavg_ros.solver.neurora.stages import apply_labels, clean, fine_tune, trust_all
 from rotavg_ros.solver.neurora.tiled.tuning import tune
 from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap, breadth_first
+from rotavg_ros.solver.sfm.certainty.attachment import Attachment, ErrorDensity
+from rotavg_ros.solver.sfm.certainty.uncertainty import References, noise_variance, variances
 from rotavg_ros.solver.sfm.consensus.search import CONSENSUS, consensus
 from rotavg_ros.solver.sfm.cycles.evidence import with_triangles
 from rotavg_ros.solver.sfm.options import SfmStages
@@ -29,9 +32,9 @@ from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
 from rotavg_ros.solver.sfm.series import EdgesInSeries
 from rotavg_ros.solver.sfm.starts.choice import Start, begin, settle_best
 from rotavg_ros.solver.sfm.starts.others import other_starts
+from rotavg_ros.solver.sfm.starts.parts import Parts
 from rotavg_ros.solver.sfm.stated.noise import StatedNoise
 from rotavg_ros.solver.sfm.step import Structure
-from rotavg_ros.solver.sfm.uncertainty import References, variances
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # For graphs with more edges it pays to measure which tile sizes are fastest on this machine.
@@ -93,7 +96,13 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
         if steps > 0:
             with watch.stage("uncertainty"):
                 to = References(component, form.first_nodes())
+                attached = _attached(cleared, answer, angle, score)
+                if attached is not None:
+                    score = torch.from_numpy(attached.scores(score.cpu().numpy())).to(score)
                 stated = variances(graph, angle, score, cleared.structure.series.bridge, to)
+                if stated is not None and attached is not None:
+                    turned = attached.variances(to.node[component].cpu().numpy())
+                    stated = stated + torch.from_numpy(turned).to(stated)
             variance = variance if stated is None else form.of_nodes(stated)
     score = score.index_select(0, form.edge)
     return Estimate(form.orientations(answer.body_from_world), score, variance, warnings=answer.warnings)
@@ -118,11 +127,19 @@ class _Cleared(NamedTuple):
 
 
 class _Answer(NamedTuple):
-    """Orientations ``(N, 4)``; their residuals ``(M,)`` rad, if known; one sentence for each warning."""
+    """An answer.
+
+    Attributes:
+        body_from_world: ``(N, 4)``.
+        residual: ``(M,)`` rad, if known.
+        warnings: one sentence each.
+        parts: parts of the graph that few edges join, if it was searched for any.
+    """
 
     body_from_world: Tensor
     residual: Tensor | None = None
     warnings: tuple[str, ...] = ()
+    parts: Parts | None = None
 
 
 def _refined(cleared: _Cleared, orientations: Tensor, stages: SfmStages, steps: int, watch: Stopwatch) -> _Answer:
@@ -149,16 +166,16 @@ def _refined(cleared: _Cleared, orientations: Tensor, stages: SfmStages, steps: 
         doubtful = 0 if best.is_doubtful is None else int(best.is_doubtful.sum())
         warnings = (_NEARLY_AS_GOOD.format(doubtful, len(component)),) if doubtful else ()
     if not stages.consensus:
-        return _Answer(orientations, warnings=warnings)
+        return _Answer(orientations, None, warnings, begun.parts)
     with watch.stage("consensus"):
         residual = EdgeResiduals(graph, orientations.float()).angles()
         other = consensus(graph, orientations, component, CONSENSUS, residual)
         if other is None:
-            return _Answer(orientations, residual, warnings)
+            return _Answer(orientations, residual, warnings, begun.parts)
         if other.body_from_world is None or other.weight is None:
-            return _Answer(orientations, residual, warnings + other.warnings)
+            return _Answer(orientations, residual, warnings + other.warnings, begun.parts)
         weights = weights.times(other.weight, other.weight)
-        return _Answer(refinement(other.body_from_world, weights=weights), None, other.warnings)
+        return _Answer(refinement(other.body_from_world, weights=weights), None, other.warnings, begun.parts)
 
 
 def _scored(cleared: _Cleared, answer: _Answer) -> tuple[Tensor, Tensor]:
@@ -170,6 +187,19 @@ def _scored(cleared: _Cleared, answer: _Answer) -> tuple[Tensor, Tensor]:
     score[series.edge] = series.score(angle[series.edge], spread[series.edge], NUMBERS.outlier_angle)
     score[series.bridge] = series.bridge_score(score, component[graph.source], len(structure.roots))
     return angle, score
+
+
+def _attached(cleared: _Cleared, answer: _Answer, angle: Tensor, score: Tensor) -> Attachment | None:
+    """How surely parts that few edges join are attached, given residuals and scores ``(M,)``; None: unknown."""
+    if answer.parts is None:
+        return None
+    graph, structure = cleared.judged.measured, cleared.structure
+    component = structure.component
+    of_edge = component[graph.source]
+    share = structure.series.false_share(score, of_edge, len(structure.roots))
+    noise = noise_variance(graph, angle, score, component)[structure.roots].sqrt()
+    density = ErrorDensity.of(*(one.cpu().numpy() for one in (angle.double(), score, of_edge, share, noise)))
+    return Attachment.of(answer.parts, np.ascontiguousarray(answer.body_from_world.cpu().double().numpy().T), density)
 
 
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:

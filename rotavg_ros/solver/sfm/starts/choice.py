@@ -49,12 +49,14 @@ class Begun(NamedTuple):
         coarse: ``(M,)`` the weights that these steps used.
         steps: number of steps.
         rival: another solution in some components, whose cost is too close to decide by; None: nowhere.
+        parts: parts of the graph that few edges join; None: it was not searched for any.
     """
 
     body_from_world: Tensor
     coarse: Tensor
     steps: int
     rival: Begun | None = None
+    parts: Parts | None = None
 
 
 def begin(
@@ -89,6 +91,7 @@ class _Search:
     shaped: Tensor
     found: list[_Found]
     best: _Found
+    parts: Parts | None = None
 
     def add(self, start: Start) -> bool:
         """Coarse steps from a start; returns whether it is the best so far, in some component."""
@@ -115,7 +118,7 @@ class _Search:
         if problem.graph.num_edges > priors.starts.most_searched:
             return []
         angle = EdgeResiduals(problem.graph, known.float()).angles()
-        parts = Parts.of(problem.graph, angle, self.shaped, priors)
+        self.parts = parts = Parts.of(problem.graph, angle, self.shaped, priors)
         at = np.ascontiguousarray(known.cpu().numpy().T)
         better = parts.improved(at, priors)
         rival = parts.rival(at if better is None else better, priors)
@@ -139,7 +142,7 @@ class _Search:
                 apart = _share_apart(problem, best.begun.body_from_world, one.begun.body_from_world)
                 is_better = is_better | (is_hardly & (apart > priors.rival_share))
             best = best.but(problem, is_better, one)
-        return best.begun._replace(rival=_rival(problem, found, best))
+        return best.begun._replace(rival=_rival(problem, found, best), parts=self.parts)
 
 
 class _Found(NamedTuple):

@@ -9,6 +9,7 @@ that lowers Σ w ‖r‖^½ most leads to a better solution, the one that raises
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -90,19 +91,16 @@ class Parts:
 
     def turns(self, body_from_world: np.ndarray) -> Turns:
         """The best turn of each branch, given orientations ``(4, N)``."""
-        node, first, branch = np.unique(self.node, return_index=True, return_inverse=True)
-        count = np.diff(np.append(first, len(branch)))
-        stated = self._stated(body_from_world)
-        weight, angle = self.weight[self.edge], _angle(stated[3])
+        node, branch = np.unique(self.node, return_inverse=True)
+        stated = self.stated(body_from_world)
+        weight, angle = self.weight[self.edge], rows.angle(stated[3])
         tries = np.flatnonzero(angle > NUMBERS.outlier_angle)
-        size, cost = count[branch[tries]], np.empty(len(tries))
-        for begin, end in pairwise(_bounds(size)):
-            one, of = tries[begin:end], size[begin:end]
-            which = np.repeat(np.arange(len(one)), of)
-            # All statements of the same branch, one after another for each of ``one``.
-            other = np.arange(len(which)) - np.repeat(np.cumsum(of) - of, of) + first[branch[one]][which]
+        cost = np.empty(len(tries))
+        begin = 0
+        for one, which, other in self.pairs(tries):
             cosine = np.einsum("ip,ip->p", stated[:, one[which]], stated[:, other])
-            cost[begin:end] = np.bincount(which, weight[other] * np.sqrt(_angle(cosine)), len(one))
+            cost[begin : begin + len(one)] = np.bincount(which, weight[other] * np.sqrt(rows.angle(cosine)), len(one))
+            begin += len(one)
         order = np.lexsort((tries, cost, branch[tries]))
         at, best = np.unique(branch[tries[order]], return_index=True)
         chosen = order[best]
@@ -110,6 +108,20 @@ class Parts:
         change[at] = cost[chosen] - np.bincount(branch, weight * np.sqrt(angle), len(node))[at]
         turn[:, at] = stated[:, tries[chosen]]
         return Turns(node, change, turn)
+
+    def pairs(self, chosen: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Some of the P edges, each beside all edges that join the same branch; some millions of pairs at a time.
+
+        Yields:
+            ``(k,)`` the next of the chosen ones, and for each pair which of these it is of, and the other edge.
+        """
+        _, first, branch = np.unique(self.node, return_index=True, return_inverse=True)
+        count = np.diff(np.append(first, len(branch)))
+        size = count[branch[chosen]]
+        for begin, end in pairwise(_bounds(size)):
+            one, of = chosen[begin:end], size[begin:end]
+            which = np.repeat(np.arange(len(one)), of)
+            yield one, which, np.arange(len(which)) - np.repeat(np.cumsum(of) - of, of) + first[branch[one]][which]
 
     def improved(self, body_from_world: np.ndarray, priors: RefinementPriors) -> np.ndarray | None:
         """The orientations ``(4, N)`` after turns that lower the cost; None if none does."""
@@ -141,12 +153,12 @@ class Parts:
             return None
         least = np.full(int(component.max()) + 1, np.inf)
         np.minimum.at(least, of_branch, change)
-        angle = _angle(rows.residual(body_from_world, self.measured, self.source, self.target)[3])
+        angle = rows.angle(rows.residual(body_from_world, self.measured, self.source, self.target)[3])
         cost = np.bincount(component[self.source], self.weight * np.sqrt(angle), len(least))
         chosen = (change <= least[of_branch]) & (change < priors.rival_cost * cost[of_branch])
         return self.turned(body_from_world, turns, chosen) if chosen.any() else None
 
-    def _stated(self, body_from_world: np.ndarray) -> np.ndarray:
+    def stated(self, body_from_world: np.ndarray) -> np.ndarray:
         """``(4, P)`` how each edge's branch would have to turn: W with R_inside W R_outside⁻¹ = measured."""
         outside = self.source[self.edge] + self.target[self.edge] - self.inside
         measured = self.measured[:, self.edge]
@@ -207,11 +219,6 @@ def _joining(
 
 def _identities(count: int) -> np.ndarray:
     return np.tile(np.array([[0.0], [0.0], [0.0], [1.0]]), count)
-
-
-def _angle(cosine: np.ndarray) -> np.ndarray:
-    """Angles in rad of rotations whose quaternions have this w, of either sign."""
-    return np.asarray(2 * np.arccos(np.minimum(np.abs(cosine), 1.0)))
 
 
 def _bounds(size: np.ndarray) -> list[int]:

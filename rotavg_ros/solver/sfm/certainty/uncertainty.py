@@ -18,9 +18,9 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem, incidence_matrix
+from rotavg_ros.solver.sfm.certainty.probes import probe_signs
 from rotavg_ros.solver.sfm.laplacians.scalar import ScalarLaplacian
 from rotavg_ros.solver.sfm.priors import RefinementPriors
-from rotavg_ros.solver.sfm.probes import probe_signs
 from rotavg_ros.view_graph import ViewGraph
 
 _WELL_KNIT_DEGREE = RefinementPriors().well_knit_degree
@@ -78,17 +78,10 @@ def variances(graph: ViewGraph, angle: Tensor, score: Tensor, bridge: Tensor, to
     size = torch.bincount(to.component, minlength=count)
     edges = torch.bincount(to.component[graph.source], minlength=count)
     is_checked, is_loose = edges >= size, 2 * edges < _WELL_KNIT_DEGREE * size
-    weight = (1 - score).clamp(min=_LEAST_WEIGHT)
-
-    def sums(value: Tensor) -> Tensor:
-        return value.new_zeros(count).index_add_(0, to.component[graph.source], value)
-
-    # Number of believed edges beyond a spanning tree, at least one.
-    checks = (sums((score < _FLAGGED).to(weight)) - size + 1).clamp(min=1)
-    noise = sums(weight * angle.to(weight).square()) / (3 * checks)
+    weight, noise = (1 - score).clamp(min=_LEAST_WEIGHT), noise_variance(graph, angle, score, to.component)
     turned = torch.zeros_like(score)
     turned[bridge] = score[bridge] * rotations.RANDOM_VARIANCE
-    weight = 1 / (1 / weight + turned / noise[to.component[graph.source]].clamp(min=_LEAST_NOISE))
+    weight = 1 / (1 / weight + turned / noise[graph.source].clamp(min=_LEAST_NOISE))
     found = weight.new_full((graph.num_nodes,), torch.nan)
     for chosen, sample in ((is_checked & is_loose, _by_factorisation), (is_checked & ~is_loose, _by_iterations)):
         nodes = chosen[to.component]
@@ -98,8 +91,21 @@ def variances(graph: ViewGraph, angle: Tensor, score: Tensor, bridge: Tensor, to
         part, of_part = graph.select_edges(edges_of), weight[edges_of]
         samples = sample(part, of_part, to)
         if samples is not None:
-            found = torch.where(nodes, noise[to.component] * _relative(part, of_part, samples, to), found)
+            found = torch.where(nodes, noise * _relative(part, of_part, samples, to), found)
     return None if bool(found.isnan().all()) else found
+
+
+def noise_variance(graph: ViewGraph, angle: Tensor, score: Tensor, component: Tensor) -> Tensor:
+    """σ² ``(N,)`` rad² of each node's component."""
+    count, of_edge = int(component.max()) + 1, component[graph.source]
+
+    def sums(value: Tensor) -> Tensor:
+        return value.new_zeros(count).index_add_(0, of_edge, value)
+
+    weight = (1 - score).clamp(min=_LEAST_WEIGHT)
+    # Number of believed edges beyond a spanning tree, at least one.
+    checks = (sums((score < _FLAGGED).to(weight)) - torch.bincount(component, minlength=count) + 1).clamp(min=1)
+    return (sums(weight * angle.to(weight).square()) / (3 * checks))[component]
 
 
 def _relative(graph: ViewGraph, weight: Tensor, samples: _Samples, to: References) -> Tensor:

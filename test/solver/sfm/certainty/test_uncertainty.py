@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from rotavg_ros import ViewGraph, rotations, solve
-from rotavg_ros.solver.sfm import uncertainty
+from rotavg_ros.solver.sfm.certainty import uncertainty
 from test.solver.graphs import as_quaternions, measured, random_truth, small_noise
 
 
