@@ -92,6 +92,16 @@ def test_a_label_holds_for_waiting_edges_and_later_ones(solver):
     assert not final(estimator).outlier.any()
 
 
+@pytest.mark.parametrize("threshold", [0.0, 0.5, 1.0])
+def test_a_label_decides_whatever_the_threshold(solver, threshold):
+    run, estimator = drive(), make(solver, replace(OPTIONS, outlier_threshold=threshold))
+    feed(estimator, run)
+    for edge_id, label in enumerate((EdgeLabel.REJECTED, EdgeLabel.ACCEPTED)):
+        estimator.add_edge(closure(run, edge_id, 0, 30))
+        assert estimator.label_edge("r", edge_id, label) == 1
+    assert final(estimator).outlier.tolist() == [False] * 13 + [True, False]
+
+
 def test_what_is_no_label_or_no_id_labels_nothing(solver, tmp_path):
     """A file with a label that does not exist could never be loaded."""
     run, online = drive(), make(solver)

@@ -108,12 +108,13 @@ class Answer:
         """The answer from a snapshot's solution, with orientations ``(N, 4)`` in their fixed gauge; ``seconds`` is 0.
 
         An edge is an outlier if its score exceeds its threshold, ``(M,)``. Edges that a user has accepted get the
-        score 0, rejected ones 1.
+        score 0, rejected ones 1; the latter are outliers whatever the threshold.
         """
         graph = snapshot.graph
         score = solution.outlier_score.cpu()
+        is_rejected = graph.label == EdgeLabel.REJECTED
         score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, score)
-        score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
+        score = torch.where(is_rejected, 1.0, score)
         return cls(
             version=version,
             robots=snapshot.robots,
@@ -133,7 +134,7 @@ class Answer:
             translation=snapshot.translation,
             steps=graph.steps.numpy(),
             outlier_score=score.numpy(),
-            outlier=score.numpy() > outlier_threshold,
+            outlier=(score.numpy() > outlier_threshold) | is_rejected.numpy(),
             waits=np.zeros(graph.num_edges, dtype=bool),
             was_cold=was_cold,
             seconds=0.0,  # known when the tick is over

@@ -14,7 +14,7 @@ from rotavg_ros.online.answer.gauge import extend_along_edges, joined, joins_com
 from rotavg_ros.online.answer.screening import Known, score_of
 from rotavg_ros.online.graph.snapshot import GraphSnapshot
 from rotavg_ros.solver.solution import Solution
-from rotavg_ros.view_graph import EdgeKind, ViewGraph
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
 
 # While data flows, a flag changes only if the score passes the threshold by this share of the distance to 0 or 1, the
 # smaller one. On a real robot's graph that halves the number of changes, and no more flags are wrong.
@@ -94,6 +94,7 @@ class Problem:
         """What is needed from a solution of :attr:`graph` to judge closures that are not part of it."""
         believed = solution.outlier_score.cpu().numpy() <= threshold
         believed &= self.graph.kind.numpy() == EdgeKind.LOOP_CLOSURE
+        believed &= self.graph.label.numpy() != EdgeLabel.REJECTED
         return Known.of_solution(self.graph, solution, believed)
 
     def of_all_edges(self, solution: Solution, known: Known) -> Solution:
