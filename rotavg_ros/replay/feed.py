@@ -132,11 +132,12 @@ def _time_lines(records: list[OdometryRecord], options: EstimatorOptions) -> NDA
     if options.on_time_jump in KEEPS_TIME_LINE:
         return time_line
     jumps, taken_ns = BackwardJumps(), GrowingArray(np.int64)
+    rule = options.time_jump_ns, options.on_time_jump
     for row, record in enumerate(records):
         stamps_ns = [record.stamp_ns]
         if len(taken_ns) and record.stamp_ns <= taken_ns.view[-1]:
             message = OdometryMessage("reference", record.stamp_ns, record.world_from_body, record.position)
-            stamps_ns = [late.stamp_ns for late in jumps.late(message, taken_ns.view, options.time_jump_ns)]
+            stamps_ns = [late.stamp_ns for late in jumps.late(message, taken_ns.view, *rule)]
             if not stamps_ns:
                 continue
             time_line[row + 1 - len(stamps_ns) :] += 1

@@ -87,7 +87,7 @@ class GraphBuilder:
     def _late(self, message: OdometryMessage, track: OdometryTrack) -> list[OdometryMessage]:
         """Note an out-of-order message; returns the messages since the robot's clock went back, once that is clear."""
         options, jumps = self.options, self.growth.backward_jumps
-        since_jump = jumps.late(message, track.samples.stamps_ns, options.time_jump_ns)
+        since_jump = jumps.late(message, track.samples.stamps_ns, options.time_jump_ns, options.on_time_jump)
         if not since_jump or options.on_time_jump in KEEPS_TIME_LINE:
             self._edges.decide(message.robot)
         return since_jump

@@ -33,7 +33,9 @@ class BackwardJumps:
         self._runs: dict[str, list[OdometryMessage]] = {}
         self._told: set[str] = set()
 
-    def late(self, message: OdometryMessage, taken_ns: NDArray[np.int64], threshold_ns: int) -> list[OdometryMessage]:
+    def late(
+        self, message: OdometryMessage, taken_ns: NDArray[np.int64], threshold_ns: int, policy: str
+    ) -> list[OdometryMessage]:
         """Note a message that was refused as out of order.
 
         Args:
@@ -41,14 +43,17 @@ class BackwardJumps:
             taken_ns: ``(n,)`` stamps of its robot's accepted messages, the newest last: the latest :data:`RECENT` or
                 more if there are as many; at least one.
             threshold_ns: going back by no more than this is not a jump.
+            policy: one of :data:`POLICIES`. With one that keeps the time line a jump is told once, until time goes on;
+                with another it is told even if one of those has applied to it before.
 
         Returns:
-            the messages since the jump, in order, once per jump; empty as long as it is not certain.
+            the messages since the jump, in order; empty as long as it is not certain, or if it has been told.
         """
         run = self._runs.setdefault(message.robot, [])
         if run and not 0 < message.stamp_ns - run[-1].stamp_ns <= _longest_step_ns(taken_ns[-RECENT:]):
             run.clear()
-        if message.robot not in self._told and int(taken_ns[-1]) - message.stamp_ns > threshold_ns:
+        is_told = policy in KEEPS_TIME_LINE and message.robot in self._told
+        if not is_told and int(taken_ns[-1]) - message.stamp_ns > threshold_ns:
             run.append(message)
         if len(run) < _RUN_LENGTH:
             return []

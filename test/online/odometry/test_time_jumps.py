@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -219,6 +222,24 @@ def test_without_reset_the_graph_is_kept_until_time_is_ahead_again(policy: str) 
     assert online.counts().time_is_back == (policy == "error")
     assert feed(online, range(LENGTH, LENGTH + 3)) == [None] * 3
     assert not online.counts().time_is_back
+
+
+@pytest.mark.parametrize("policy", ["new_component", "reset"])
+@pytest.mark.parametrize("restart", [False, True])
+def test_another_policy_applies_to_a_jump_that_was_refused(policy: str, restart: bool, tmp_path: Path) -> None:
+    online = estimator("error")
+    feed(online, range(LENGTH))
+    feed(online, range(10))
+    if restart:
+        online.save(tmp_path / "state.npz")
+        online = estimator(policy)
+        online.load(tmp_path / "state.npz")
+    else:
+        online.set_options(replace(online.options, on_time_jump=policy))
+    assert online.counts().keyframes == LENGTH
+    feed(online, range(10, 30))
+    assert online.counts().keyframes == (20 if policy == "reset" else LENGTH + 20)
+    assert not online.counts().time_is_back and feed(online, range(30, 33)) == [None] * 3
 
 
 def test_a_small_step_back_is_only_out_of_order() -> None:
