@@ -49,7 +49,7 @@ class ForeignGraph:
     def note_given_up(self, source: KeyframeReference, target: KeyframeReference) -> None:
         _make_room(self._loss)
         self._num_losses += 1
-        self._loss[_key(source), _key(target)] = self._num_losses
+        self._loss[ends_of(source, target)] = self._num_losses
 
     def _note_stamp(self, key: Key, stamp_ns: int) -> None:
         """Remember when a keyframe was taken; 0 means that the sender does not say."""
@@ -89,6 +89,11 @@ class ForeignGraph:
         # The sensor's position on the body is unknown, so its translation is taken for that of the body.
         position = quaternion.rotate(self._source.body_from_sensor, to_vector(translation))
         yield EdgeRecord(EdgeMeasurement(edge_id, source, target, inside, kind, precision, position))
+
+
+def ends_of(source: KeyframeReference, target: KeyframeReference) -> tuple[Key, Key]:
+    """The ends of an edge by keyframe id."""
+    return _key(source), _key(target)
 
 
 def _key(end: KeyframeReference) -> Key:

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from typing import Any
 
 from rotavg_ros.inputs.fields import Key, edge_id_of, precision_of_covariance, to_nanoseconds
-from rotavg_ros.inputs.foreign_graph import ForeignGraph, edges_in_order
+from rotavg_ros.inputs.foreign_graph import ForeignGraph, edges_in_order, ends_of
 from rotavg_ros.inputs.records import EdgeRecord, EdgeVerdict, Source
-from rotavg_ros.online import RejectReason
+from rotavg_ros.online import KeyframeReference, RejectReason
 from rotavg_ros.online.measurements import RejectedInputError
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
@@ -40,6 +40,10 @@ class PoseGraphConverter(ForeignGraph):
     def forget(self) -> None:
         super().forget()
         self._rejected.clear()
+
+    def note_given_up(self, source: KeyframeReference, target: KeyframeReference) -> None:
+        super().note_given_up(source, target)
+        self._rejected.discard(ends_of(source, target))  # when it is sent again, so is the verdict
 
     def __call__(self, message: Any) -> Iterator[EdgeRecord | EdgeVerdict]:
         for node in message.nodes:

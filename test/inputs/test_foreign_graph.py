@@ -63,6 +63,15 @@ def test_a_senders_verdict_on_a_closure() -> None:
     assert list(late(pose_graph(3)))[-1] == rejected[0]
 
 
+def test_a_verdict_is_sent_again_with_a_closure_that_was_given_up() -> None:
+    """Where a full graph had no room for it, nothing of it was kept, nor the verdict."""
+    convert = converter("pose_graph_tools_msgs/msg/PoseGraph")
+    closure, verdict = list(convert(pose_graph(3)))[-2:]
+    convert.note_given_up(closure.edge.source, closure.edge.target)
+    assert list(convert(pose_graph(3))) == [closure, verdict]
+    assert list(convert(pose_graph(3))) == []
+
+
 def closures_between(*ends: tuple[int, int]) -> Fields:
     """The graph of the square, all of whose closures are others."""
     graph = map_graph()
