@@ -26,8 +26,9 @@ class EstimatorOptions:
     """How the graph grows and how it is solved.
 
     Keyframes that are chosen from odometry are numbered 0, 1, 2 … per robot. Where a front end sends them, one without
-    an id gets its stamp as id, and odometry only carries the newest one on to the present. Edges of odometry come on
-        top of ``max_edges``. How a graph stays within its bounds: :mod:`~rotavg_ros.online.compaction.thinning`.
+    an id gets its stamp as id (the next free number where a keyframe of an earlier time line has that), and odometry
+    only carries the newest one on to the present. Edges of odometry come on top of ``max_edges``. How a graph stays
+    within its bounds: :mod:`~rotavg_ros.online.compaction.thinning`.
 
     Raises:
         OptionError: a value that an option cannot have.

@@ -8,7 +8,6 @@ from rotavg_ros.online.graph.growing_view_graph import GrowingViewGraph
 from rotavg_ros.online.graph.growth import Growth
 from rotavg_ros.online.graph.snapshot import GraphEdge
 from rotavg_ros.online.measurements import (
-    UNKNOWN_STAMP_NS,
     EdgeMeasurement,
     OdometryMessage,
     RejectedInputError,
@@ -142,10 +141,9 @@ class GraphBuilder:
         assert track.latest is not None
         previous, latest = track.last_keyframe, track.latest
         source = self.graph.node(robot, track.num_keyframes - 1)
-        while self._is_anothers(robot, track.num_keyframes, (latest.stamp_ns, track.time_line)):
-            track.num_keyframes += 1
-        keyframe_id = track.num_keyframes
-        node = self.graph.add_keyframe(robot, keyframe_id, latest.stamp_ns, track.time_line)
+        moment = latest.stamp_ns, track.time_line
+        keyframe_id = track.num_keyframes = self.graph.free_id(robot, track.num_keyframes, moment)
+        node = self.graph.add_keyframe(robot, keyframe_id, *moment)
         if previous is not None:
             assert source is not None
             turn = quaternion.multiply(quaternion.inverse(latest.world_from_body), previous.world_from_body)
@@ -156,11 +154,3 @@ class GraphBuilder:
             )
         track.mark_keyframe()
         self._edges.place_all(self.growth.pending.pop_keyframe(robot, keyframe_id))
-
-    def _is_anothers(self, robot: str, keyframe_id: int, moment: tuple[int, int]) -> bool:
-        """Whether a keyframe of another moment has this id; a front end may have used it before odometry did."""
-        node = self.graph.node(robot, keyframe_id)
-        if node is None:
-            return self.graph.lies_on_an_edge(robot, keyframe_id)
-        stamp_ns, _ = known = self.graph.moment_of(node)
-        return stamp_ns != UNKNOWN_STAMP_NS and known != moment

@@ -122,16 +122,19 @@ class EdgePlacement:
         chosen_by_front_end = growth.options.keyframe_source == "edges" and edge.kind == EdgeKind.ODOMETRY
         for end in (edge.source, edge.target):
             stamp_ns = UNKNOWN_STAMP_NS if end.stamp_ns is None else end.stamp_ns
+            time_line = growth.time_line_of(end.robot, end.stamp_ns)
             if end.keyframe_id is not None and (chosen_by_front_end or growth.options.unknown_keyframes == "create"):
                 keyframe_id = end.keyframe_id
             elif end.keyframe_id is None and chosen_by_front_end:
-                keyframe_id = stamp_ns
+                if growth.graph.marginalized_keyframe(end.robot, None, stamp_ns, time_line) is not None:
+                    continue
+                keyframe_id = growth.graph.free_id(end.robot, stamp_ns, (stamp_ns, time_line))
             else:
                 continue
             is_new = growth.graph.node(end.robot, keyframe_id) is None
             if is_new and (growth.graph.was_marginalized(end.robot, keyframe_id) or not growth.has_room_for_keyframe()):
                 continue
-            growth.graph.add_keyframe(end.robot, keyframe_id, stamp_ns, growth.time_line_of(end.robot, end.stamp_ns))
+            growth.graph.add_keyframe(end.robot, keyframe_id, stamp_ns, time_line)
             self.place_all(growth.pending.pop_keyframe(end.robot, keyframe_id))
         if chosen_by_front_end:
             growth.advance_data_time(max(end.stamp_ns or 0 for end in (edge.source, edge.target)))

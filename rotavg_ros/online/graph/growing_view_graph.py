@@ -153,6 +153,23 @@ class GrowingViewGraph:
         """Whether it is a marginalised keyframe whose pose is still known."""
         return self._marginalized_row(robot, keyframe_id) is not None
 
+    def free_id(self, robot: str, keyframe_id: int, moment: tuple[int, int]) -> int:
+        """The first id from this one on that is no keyframe's of another moment (a stamp and its time line).
+
+        A front end may have used an id before odometry did, and stamps that serve as ids come again on another time
+        line.
+        """
+        while self._is_anothers(robot, keyframe_id, moment):
+            keyframe_id += 1
+        return keyframe_id
+
+    def _is_anothers(self, robot: str, keyframe_id: int, moment: tuple[int, int]) -> bool:
+        node = self.node(robot, keyframe_id)
+        if node is None:
+            return self.lies_on_an_edge(robot, keyframe_id)
+        stamp_ns, _ = known = self.moment_of(node)
+        return stamp_ns != UNKNOWN_STAMP_NS and known != moment
+
     def was_marginalized(self, robot: str, keyframe_id: int) -> bool:
         """Whether there was such a keyframe, known or forgotten."""
         if self.lies_on_an_edge(robot, keyframe_id):

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator, RejectReason
+from rotavg_ros.view_graph import EdgeKind
 
 SECOND = 1_000_000_000
 LENGTH = 60
@@ -126,6 +127,25 @@ def test_stamps_mean_the_time_line_that_has_come_last(kept) -> None:
         assert torch.allclose(again, first, atol=1e-12)
     answer = kept.tick()
     assert answer.num_components == 3 and len(set(answer.stamp_ns.tolist())) == LENGTH
+
+
+@pytest.mark.parametrize("max_keyframes", [1000, 12])
+def test_keyframes_that_a_front_end_names_by_stamps_alone_are_others_on_each_time_line(
+    solver, max_keyframes: int
+) -> None:
+    """Also where the first have been marginalised by the time their stamps come again."""
+    options = EstimatorOptions(keyframe_source="edges", max_keyframes=max_keyframes)
+    online, steps = OnlineEstimator(options, solver), range(0, LENGTH - 10, 10)
+    for _ in range(3):
+        feed(online, range(LENGTH))
+        for step in steps:
+            edge = replace(closure(step, step * SECOND // 10, step * SECOND // 10 + SECOND), kind=EdgeKind.ODOMETRY)
+            said = [online.add_edge(edge) for _ in range(2)]
+            assert said == [None, RejectReason.DUPLICATE_EDGE]
+    counts, answer = online.counts(), online.tick()
+    assert answer.num_components == 3 and len(answer.keyframe_id) + counts.marginalized == 18
+    assert set(answer.time_line.tolist()) == {0, 1, 2} and (counts.marginalized > 0) == (max_keyframes < 18)
+    assert counts.rejected == {"duplicate_edge": 15}
 
 
 def test_a_stamp_that_the_present_time_line_does_not_cover_means_an_earlier_one(kept) -> None:
