@@ -65,7 +65,7 @@ class Input:
 
     @property
     def is_odometry(self) -> bool:
-        return bool(self.robot)
+        return self.parameter == "odometry_topics"
 
     def is_published(self) -> None:
         """The topic has a publisher now."""

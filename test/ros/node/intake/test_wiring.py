@@ -18,6 +18,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rotavg_msgs.msg import AbsoluteOrientations, KeyframeReference, RelativeRotation, RelativeRotationArray
 from std_msgs.msg import Header
 
+from rotavg_ros.ros.node.intake.wiring import Input
+
 pytestmark = pytest.mark.ros
 
 NODE = Path(sys.executable).with_name("rotavg_node")
@@ -175,3 +177,11 @@ def on_tf(message):
 node.create_subscription(TFMessage, "/tf", on_tf, 100)
 rclpy.spin(node)
 """
+
+
+@pytest.mark.parametrize("robot", ["", "a"])
+def test_odometry_is_odometry_whatever_the_robot_is_called(robot: str) -> None:
+    """With ``robots:=['']`` it was taken for edges, and waited for them."""
+    odom = Input("/odom", "nav_msgs/msg/Odometry", "odometry_topics", robot, QoSProfile(depth=1))
+    edges = Input("/edges", "rotavg_msgs/msg/RelativeRotation", "edge_topics", "", QoSProfile(depth=1))
+    assert odom.is_odometry and not edges.is_odometry
