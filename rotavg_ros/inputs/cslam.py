@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rotavg_ros.inputs.fields import Key, edge_id_of, target_from_source, to_nanoseconds, to_tuple, to_vector
-from rotavg_ros.inputs.foreign_graph import ForeignGraph
+from rotavg_ros.inputs.foreign_graph import ForeignGraph, contradict
 from rotavg_ros.inputs.records import EdgeRecord, Source
 from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason, quaternion
 from rotavg_ros.online.measurements import RejectedInputError, checked_rotation
@@ -33,7 +33,7 @@ class KeyframeOdomConverter:
 
     Where messages were lost the edge spans the gap, since each message carries the whole odometry. A new chain, without
     an edge to the last one, begins where the odometry has jumped, and after an id that does not ascend. Such an id is
-    refused: a sender that starts counting again has new odometry.
+    refused: a sender that starts counting again has new odometry. So is an edge that contradicts one in the graph.
     """
 
     def __init__(self, source: Source) -> None:
@@ -65,7 +65,7 @@ class KeyframeOdomConverter:
             self._last = self._before = None
             raise RejectedInputError(RejectReason.OUT_OF_ORDER_ODOMETRY)
         robot = self._source.robot
-        edge_id = edge_id_of((robot, self._last_id), (robot, keyframe_id), EdgeKind.ODOMETRY)
+        ends = (robot, self._last_id), (robot, keyframe_id)
         last, before = self._last, self._before
         now = _Keyframe(KeyframeReference(robot, keyframe_id, stamp_ns or None), sample)
         self._last_id, self._last, self._before = keyframe_id, now, last.odometry if last else None
@@ -74,7 +74,11 @@ class KeyframeOdomConverter:
         if has_jumped(sample, last.odometry, before, self._source.limits):
             self._before = None
             return None
-        return self._edge(edge_id, last, now)
+        edge = self._edge(edge_id_of(*ends, EdgeKind.ODOMETRY), last, now)
+        known = self._source.odometry_between(*ends)
+        if known is not None and contradict(known, edge.target_from_source):
+            raise RejectedInputError(RejectReason.CONTRADICTORY_ODOMETRY)
+        return edge
 
     def _edge(self, edge_id: int, last: _Keyframe, now: _Keyframe) -> EdgeMeasurement:
         last_from_world = quaternion.inverse(last.odometry.world_from_body)

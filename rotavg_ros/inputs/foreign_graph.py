@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from rotavg_ros.inputs.fields import Key, edge_id_of, target_from_source, to_tuple, to_vector
@@ -28,7 +28,7 @@ class ForeignGraph:
 
     A repeated closure with another rotation is another measurement of the same pair. A repeated odometry edge may be
     refined slightly; with a very different rotation it is refused, because then the sender has begun anew and uses the
-    same ids for other places.
+    same ids for other places. That holds of edges in a graph that was loaded, too.
     """
 
     def __init__(self, source: Source) -> None:
@@ -80,7 +80,9 @@ class ForeignGraph:
             return
         if kind == EdgeKind.ODOMETRY:
             _make_room(self._odometry)
-            if quaternion.angle_between(self._odometry.setdefault(ends, inside), inside) > _LARGEST_REFINEMENT:
+            known = self._odometry.get(ends) or self._source.odometry_between(*ends) or inside
+            self._odometry[ends] = known
+            if contradict(known, inside):
                 yield EdgeRecord(RejectReason.CONTRADICTORY_ODOMETRY)
                 return
         self._seen.add(measurement)
@@ -89,6 +91,11 @@ class ForeignGraph:
         # The sensor's position on the body is unknown, so its translation is taken for that of the body.
         position = quaternion.rotate(self._source.body_from_sensor, to_vector(translation))
         yield EdgeRecord(EdgeMeasurement(edge_id, source, target, inside, kind, precision, position))
+
+
+def contradict(known: Quaternion, repeated: Sequence[float]) -> bool:
+    """Whether two rotations of odometry between the same keyframes are not one and its refinement."""
+    return quaternion.angle_between(known, quaternion.normalize(repeated)) > _LARGEST_REFINEMENT
 
 
 def ends_of(source: KeyframeReference, target: KeyframeReference) -> tuple[Key, Key]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
 
+from rotavg_ros.inputs.fields import Key
 from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason
 from rotavg_ros.online.odometry.continuity import ANY_MOTION, ContinuityLimits
 from rotavg_ros.online.quaternion import IDENTITY, Quaternion, Vector, multiply
@@ -23,12 +24,15 @@ class Source:
         robots: names of all robots, for messages that number them.
         body_from_sensor: orientation, in the body frame, of the sensor frame in which the messages state rotations.
         limits: largest believable change of odometry from one keyframe to the next.
+        odometry_between: target_from_source of the odometry edge that the graph has from one keyframe to another, None
+            if there is none: a graph may have been loaded, or built from other topics.
     """
 
     robot: str
     robots: tuple[str, ...] = ()
     body_from_sensor: Quaternion = IDENTITY
     limits: ContinuityLimits = ANY_MOTION
+    odometry_between: Callable[[Key, Key], Quaternion | None] = lambda source, target: None
 
     def robot_of(self, number: int) -> str:
         """Name of the robot with a number, which is its place in ``robots`` unless robots there are named by numbers.

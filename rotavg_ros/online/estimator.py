@@ -125,6 +125,11 @@ class OnlineEstimator:
             self._content.state.growth.given_up.clear()
             return given_up
 
+    def odometry_between(self, source: tuple[str, int], target: tuple[str, int]) -> Quaternion | None:
+        """Measured target_from_source of the first odometry edge from one keyframe, (robot, id), to another, if any."""
+        with self._lock:
+            return self._content.builder.graph.odometry_between(source, target)
+
     def reject(self, reason: RejectReason) -> None:
         """Count an input that could not even be read as a measurement."""
         with self._lock:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -53,6 +54,7 @@ class Feed:
             odometry = partial(self._take_odometry, robot, ODOMETRY_CONVERTERS[source.type_name], sensor)
             self._handlers.setdefault(source.topic, []).append(odometry)
         for source, about in zip(plan.edges, parameters.edge_sources(), strict=True):
+            about = replace(about, odometry_between=estimator.odometry_between)
             convert = EDGE_CONVERTERS[source.type_name](about)
             self._edge_converters.append(convert)
             edges = partial(self._take_edges, convert, source.topic)

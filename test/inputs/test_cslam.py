@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace as Fields
 
+import pytest
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.inputs import EDGE_CONVERTERS, Source
@@ -27,6 +28,25 @@ def test_keyframes_whose_numbers_start_again_begin_a_new_chain() -> None:
             for edge in edges(convert(Fields(id=number, odom=keyframe_odometry(number).odom)))
         )
     assert pairs == [(0, 1), (1, 3), RejectReason.OUT_OF_ORDER_ODOMETRY, (4, 5)]
+
+
+@pytest.mark.parametrize("turned_deg", [1.0, 30.0])
+def test_steps_that_contradict_a_graph_that_was_loaded_are_refused(turned_deg: float) -> None:
+    """A robot that was switched off and on counts its keyframes anew."""
+
+    def odometry_between(*ends: tuple[str, int]) -> tuple[float, ...] | None:
+        return (0.0, 0.0, 0.0, 1.0) if ends == (("b", 0), ("b", 1)) else None
+
+    convert = EDGE_CONVERTERS["cslam_common_interfaces/msg/KeyframeOdom"](
+        Source("b", odometry_between=odometry_between)
+    )
+    said = []
+    for number in range(3):
+        turned = quaternion(Rotation.from_euler("z", turned_deg * number, degrees=True))
+        pose = Fields(position=Fields(x=0.0, y=0.0, z=0.0), orientation=turned)
+        odom = Fields(header=Fields(stamp=stamp(number)), pose=Fields(pose=pose))
+        said += [edge is RejectReason.CONTRADICTORY_ODOMETRY for edge in edges(convert(Fields(id=number, odom=odom)))]
+    assert said == [turned_deg > 10, False]
 
 
 def test_keyframes_of_odometry_that_begins_anew_begin_a_new_chain() -> None:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace as Fields
 
+import pytest
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.inputs import EdgeVerdict, foreign_graph
+from rotavg_ros.inputs import EDGE_CONVERTERS, EdgeVerdict, Source, foreign_graph
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, OnlineEstimator, RejectReason
 from rotavg_ros.view_graph import EdgeLabel
 
 from .square import (
+    BODY_FROM_SENSOR,
     converter,
     edges,
     link,
@@ -50,6 +53,34 @@ def test_odometry_that_contradicts_itself_is_refused() -> None:
     assert again(30.0) == again(30.0) == [RejectReason.CONTRADICTORY_ODOMETRY]
     convert.forget()
     assert isinstance(again(30.0)[0], EdgeMeasurement)
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 3.0, 30.0])
+@pytest.mark.parametrize("is_loaded", [False, True])
+def test_odometry_that_contradicts_the_graph_is_refused_whoever_told_of_it(
+    turned_deg: float, is_loaded: bool, tmp_path: Path
+) -> None:
+    """A robot is switched off and on, and its front end begins anew; or another topic has been faster."""
+    online = Reader().online
+    for record in converter("rtabmap_msgs/msg/MapGraph")(map_graph()):
+        assert online.add_edge(record.edge) is None
+    if is_loaded:
+        online.save(tmp_path / "state.npz")
+        online = Reader().online
+        online.load(tmp_path / "state.npz")
+    before = online.snapshot().graph
+    source = Source("b", body_from_sensor=tuple(BODY_FROM_SENSOR.as_quat()), odometry_between=online.odometry_between)
+    convert, turn = EDGE_CONVERTERS["rtabmap_msgs/msg/MapGraph"](source), Rotation.from_euler("y", turned_deg, True)
+    graph = map_graph()
+    graph.links = [link(0, 1, 0)]
+    graph.links[0].transform.rotation = quaternion(world_from_sensor(0).inv() * world_from_sensor(1) * turn)
+    (record,) = convert(graph)
+    if turned_deg > 10:
+        assert record.edge is RejectReason.CONTRADICTORY_ODOMETRY
+    else:
+        assert online.add_edge(record.edge) is (RejectReason.DUPLICATE_EDGE if turned_deg == 0 else None)
+    assert online.snapshot().graph.num_edges == before.num_edges + (turned_deg == 3)
+    assert online.odometry_between(("b", 1), ("b", 0)) is online.odometry_between(("b", 0), ("b", 7)) is None
 
 
 def test_a_senders_verdict_on_a_closure() -> None:

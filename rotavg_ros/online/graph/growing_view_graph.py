@@ -18,7 +18,7 @@ from rotavg_ros.online.graph.snapshot import GraphEdge, GraphSnapshot
 from rotavg_ros.online.growing_array import GrowingArray
 from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS
 from rotavg_ros.online.quaternion import Quaternion, Vector
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
 _KEYFRAME_COLUMNS = {"robot": np.int64, "keyframe_id": np.uint64, "stamp_ns": np.int64, "time_line": np.int64}
 _EDGE_COLUMNS = {
@@ -103,6 +103,19 @@ class GrowingViewGraph:
     def node(self, robot: str, keyframe_id: int) -> int | None:
         index = self._index_of(robot)
         return None if index is None else index.node(keyframe_id)
+
+    def odometry_between(self, source: tuple[str, int], target: tuple[str, int]) -> Quaternion | None:
+        """Measured target_from_source of the first odometry edge from one keyframe, (robot, id), to another, if any."""
+        ends = self.node(*source), self.node(*target)
+        if None in ends:
+            return None
+        is_wanted = self._edge["kind"].view == EdgeKind.ODOMETRY
+        for name, node in zip(("source", "target"), ends, strict=True):
+            is_wanted &= self._edge[name].view == node
+        if not is_wanted.any():
+            return None
+        x, y, z, w = self._edge["target_from_source"].view[int(is_wanted.argmax())].tolist()
+        return (x, y, z, w)
 
     def robot_of(self, node: int) -> str:
         return self.robots[int(self._keyframe["robot"].view[node])]
