@@ -40,7 +40,8 @@ class Decision(Generic[_Item]):
 @dataclass
 class _Waiting(Generic[_Item]):
     since: float
-    items: list[_Item]
+    items: list[_Item] = field(default_factory=list)
+    measurements: set[int] = field(default_factory=set)
 
 
 class ClosureFilter(Generic[_Item]):
@@ -69,19 +70,27 @@ class ClosureFilter(Generic[_Item]):
         """Number of closures that wait."""
         return len(self._waiting)
 
-    def take(self, name: EdgeName, item: _Item, now: float) -> None:
+    def take(self, name: EdgeName, item: _Item, now: float, measurement: int = 0) -> None:
         """Take a closure, or another measurement of the same name.
 
         Args:
             name: the sender's.
             item: to be handed out when it passes.
             now: seconds.
+            measurement: tells it from others of the name, see :meth:`waits`.
         """
         key = _key(name)
         if key not in self._waiting and len(self._waiting) >= _MOST_WAITING:
             del self._waiting[next(iter(self._waiting))]
             self.dropped += 1
-        self._waiting.setdefault(key, _Waiting(now, [])).items.append(item)
+        waiting = self._waiting.setdefault(key, _Waiting(now))
+        waiting.items.append(item)
+        waiting.measurements.add(measurement)
+
+    def waits(self, name: EdgeName, measurement: int) -> bool:
+        """Whether this very measurement waits."""
+        waiting = self._waiting.get(_key(name))
+        return waiting is not None and measurement in waiting.measurements
 
     def knows(self, name: EdgeName) -> bool:
         """Whether a closure of this name waits or has passed."""

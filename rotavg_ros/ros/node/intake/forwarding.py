@@ -247,11 +247,13 @@ class Forwarding:
             if generation != self._generation:
                 return
             if record.edge.kind == EdgeKind.LOOP_CLOSURE:
-                name = record.edge.source.robot, record.edge.edge_id
+                name, measurement = (record.edge.source.robot, record.edge.edge_id), record.edge.fingerprint()
+                if forward.filter.waits(name, measurement):  # the estimator may have given it up meanwhile
+                    return
                 is_known = forward.filter.knows(name)
                 forward.shares_names |= is_known and refusal is None
                 if not is_known or refusal is None:
-                    forward.filter.take(name, record.element, time.monotonic())
+                    forward.filter.take(name, record.element, time.monotonic(), measurement)
                 return
         if refusal is None:
             forward.send([record.element])

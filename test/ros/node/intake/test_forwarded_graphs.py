@@ -8,7 +8,11 @@ from types import SimpleNamespace as Fields
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
-from rotavg_ros.ros.node.intake.forwarding import WholeGraphForward
+from rotavg_ros.inputs import EdgeRecord, Source
+from rotavg_ros.online import EdgeMeasurement, KeyframeReference, OnlineEstimator
+from rotavg_ros.ros.node.intake import adapters
+from rotavg_ros.ros.node.intake.forwarding import Forwarding, WholeGraphForward
+from rotavg_ros.settings.parameters import NodeParameters
 
 
 @dataclass
@@ -108,3 +112,24 @@ def test_after_a_reset_nothing_of_before_goes_out() -> None:
     assert run.goes() == []
     run.comes(0, 1)
     assert run.goes() == [[0]]
+
+
+def test_a_closure_that_was_given_up_and_is_sent_again_goes_out_once(probe_node) -> None:
+    """It waited for its keyframe for too long, so the estimator takes it once more."""
+    options = {"forward_topics": ["edges:trusted"], "edge_topics": ["edges"], "pending_timeout_s": 5.0}
+    parameters = NodeParameters().changed(options | {"keyframe_angle_deg": 0, "keyframe_distance_m": 0})
+    online = OnlineEstimator(parameters.estimator)
+    forwarding = Forwarding(probe_node, parameters, online)
+    forward = forwarding.of(adapters.edge_topic("edges", Source("r")))
+    sent: list[str] = []
+    forward.send = sent.extend
+    ends = KeyframeReference("r", 0), KeyframeReference("r", 20)
+    record = EdgeRecord(EdgeMeasurement(7, *ends, (0.0, 0.0, 0.0, 1.0)), element="it")
+    for second in range(30):
+        if second in {0, 15}:
+            forwarding.taken(forward, record, online.add_edge(record.edge), online.generation)
+        online.add_odometry("r", (100 + second) * 10**9, (0.0, 0.0, 0.0, 1.0))
+    assert online.counts().rejected == {"pending_timeout": 1} and online.counts().edges == 30
+    assert forwarding.waiting == 1 and not forward.shares_names
+    forwarding.decide(online.tick())
+    assert sent == ["it"] and forwarding.waiting == 0
