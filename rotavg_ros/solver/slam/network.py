@@ -1,9 +1,9 @@
 """CleanNet of the SLAM profile: judges loop closures by which of them agree.
 
-Four layers along a chain of 10⁴ keyframes see nothing of a loop. The SLAM network therefore passes its messages
-between *closures*: each one hears from the closures nearest to it along the odometry (``agreement.py``), and knows of
-itself how far it is from what odometry predicts. All inputs are in units of the estimated noise, so one network serves
-all scales.
+Along a chain of 10⁴ keyframes, four layers do not reach round a loop. So the SLAM network passes its messages between
+*closures*: each receives those of the closures nearest to it along the odometry (``agreement.py``), and has its own
+discrepancy with the odometry as a feature. All inputs are in units of the estimated noise, so one network serves all
+scales.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class ClosureFeatures:
     """Input of :class:`SlamCleanNet` for C closures and P agreement pairs (float32).
 
     Attributes:
-        closures: ``(C, 7)`` what each closure is by itself.
-        pairs: ``(P, 4)`` how two closures agree.
-        edges: messages run second → first.
+        closures: ``(C, 7)`` features of each closure.
+        pairs: ``(P, 4)`` features of each pair.
+        edges: messages, which run second → first.
     """
 
     closures: Tensor
@@ -53,7 +53,7 @@ def closure_features(
         (
             np.clip(judge_by_chain(noise, squared_angle, path_steps) / _LOG_ODDS_SCALE, -3, 1.5),
             np.where(finite, np.arcsinh(np.sqrt(squared_angle / variance)), 0.0),
-            # Between chains that closures alone join it depends on which of these the chains were drawn together by.
+            # Between chains that only closures join, the angle depends on which closure the forest happens to use.
             np.where(finite, np.sqrt(np.minimum(squared_angle, np.pi**2)), 0.0),
             np.where(finite, np.log10(1e-3 + drift / noise.closure_variance), 3.0),
             np.full(count, np.log10(np.sqrt(noise.closure_variance)) + 1.5),
@@ -84,7 +84,7 @@ def closure_features(
 
 
 class SlamCleanNet(StoredNetwork):
-    """Log-odds of every loop closure to be false."""
+    """Predicts the log-odds that each loop closure is false."""
 
     NAME = "slam-clean-net"
 
@@ -94,17 +94,17 @@ class SlamCleanNet(StoredNetwork):
         self.outlier_head = nn.Linear(HIDDEN_WIDTH + NUM_CLOSURE_FEATURES, 1)
 
     def forward(self, features: ClosureFeatures) -> Tensor:
-        """``(C,)``."""
+        """``(C,)`` log-odds that each closure is false."""
         states, _ = self.network(features.closures, features.pairs, features.edges)
         log_odds: Tensor = self.outlier_head(torch.cat((states, features.closures), dim=1))
         return log_odds.squeeze(1)
 
 
 def false_log_odds(network: SlamCleanNet, features: ClosureFeatures) -> Tensor:
-    """Log-odds of every closure to be false ``(C,)``; messages must be sorted by the closure that gets them."""
+    """``(C,)`` log-odds that each closure is false; messages must be sorted by the closure that receives them."""
     edges = features.edges
     arriving = torch.bincount(edges.target, minlength=edges.num_nodes).cumsum(0)
-    # Every message is a row of its own; none is another one reversed.
+    # Each message has its own row; none is the reverse of another.
     sorted_edges = SortedEdges(
         torch.cat((arriving.new_zeros(1), arriving)).int(),
         edges.source.int(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-# Terms of the posterior, moves and starts of its search, and the networks, each with what holds without it.
+# Terms of the posterior, moves and starts of its search, and the networks, each with what is assumed without it.
 SWITCHES: dict[str, str] = {
     "cleannet": "closures are judged beforehand by their discrepancy with the odometry alone",
     "tree": "the search begins at odometry's orientations, not along CleanNet's tree",

@@ -33,8 +33,8 @@ _BIAS_GAIN = 0.2
 _BIAS_ROUNDS = 2
 # Units of work to contract an edge, and to compare a closure with its neighbours.
 _EDGE, _CLOSURE = 0.002, 0.008
-# It is not looked for, or not any further, where a cheaper look promises less than such parts of that gain: at most the
-# closures that disagree and are confirmed by a neighbour, and what the first round explains.
+# A cheaper look comes first, and must promise at least such parts of that gain: the share of closures that disagree and
+# are confirmed by a neighbour, and the share that the first round explains.
 _BIAS_CONFIRMED, _BIAS_EXPLAINED = 0.75, 0.4
 
 
@@ -79,7 +79,7 @@ def prepare(graph: ViewGraph) -> Prepared:
 
 
 def prepare_as_it_is(graph: ViewGraph, components: int | None = None) -> Prepared:
-    """The same without regard to a bias; ``components`` of the noise, by default as many as rotations have."""
+    """The same without removing a bias; ``components`` of the noise: by default, those of the rotations."""
     closure_graph, forest = draw_together(graph)
     spend(_CLOSURE * int(closure_graph.is_closure.sum()))
     closure = closure_graph.is_closure
@@ -91,7 +91,7 @@ def prepare_as_it_is(graph: ViewGraph, components: int | None = None) -> Prepare
 
 
 def likely_bias(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:
-    """``(3,)`` rad per step, what may be wrong with all steps alike; None if most closures agree with the odometry."""
+    """``(3,)`` rad per step, a possible bias of all odometry; None if most closures agree with the odometry."""
     if prepared.noise.outlier_share <= _BIASED_SHARE or not _may_be_biased(prepared):
         return None
     noise = noise_between_neighbours(prepared.pairs, prepared.noise.components)
@@ -108,7 +108,7 @@ def likely_bias(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:
 
 
 def _may_be_biased(prepared: Prepared) -> bool:
-    """Whether enough closures disagree with the odometry that neighbours confirm: others no bias will explain."""
+    """Whether enough closures disagree with the odometry and are confirmed by a neighbour, as a bias would imply."""
     is_agreed = agree(prepared.pairs, prepared.noise)
     is_confirmed = np.bincount(prepared.pairs.first, is_agreed, len(prepared.squared_angle)) > 0
     disagrees = judge_by_chain(prepared.noise, prepared.squared_angle, prepared.path_steps) < 0
@@ -116,7 +116,7 @@ def _may_be_biased(prepared: Prepared) -> bool:
 
 
 def draw_together(graph: ViewGraph) -> tuple[ClosureGraph, SpanningForest]:
-    """The closure graph, and the forest along which the chains were drawn together; rejected edges take no part."""
+    """The closure graph, and the forest along which it was contracted; rejected edges take no part."""
     spend(_EDGE * graph.num_edges)
     usable = graph.label != EdgeLabel.REJECTED
     cost = torch.where(graph.is_odometry, 1.0, _CLOSURE_COST)

@@ -29,12 +29,12 @@ from rotavg_ros.solver.slam.preparation import Prepared, prepare
 from rotavg_ros.solver.slam.update.memory import SlamMemory, estimate_of, with_poses
 from rotavg_ros.view_graph import ViewGraph
 
-# Estimated work of an update, as a share of a whole solve's, until one has been measured.
+# Assumed work of an update, as a share of a whole solve's, until one has been measured.
 _UPDATE = 0.1
 
 
 def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
-    """One method on a graph on the CPU; repeated statements of the same measurement count once."""
+    """Solves a graph on the CPU; of several statements of one measurement only the first counts."""
     repeats = first_of_each(graph)
     if repeats is None:
         return _solve_once(graph, stages, run)
@@ -47,13 +47,13 @@ def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
 
 
 def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
-    """The same for a graph without repetitions."""
+    """Solves a graph without repeated edges."""
     refines = stages.refine if run.refinement_steps is None else run.refinement_steps > 0
     return whole(graph, stages, run) if refines else _solve_by_tree(graph, stages, run)
 
 
 def _solve_by_tree(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
-    """Contracts the odometry, judges the closures, and takes orientations along the tree of least expected error."""
+    """Contracts the odometry, judges the closures, and composes orientations along the tree of least expected error."""
     watch = run.watch
     with watch.stage("contract"):
         prepared = prepare(graph)
@@ -70,7 +70,7 @@ def _solve_by_tree(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
 def whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     """Solves by the posterior: search from all starts, FineNet, the published answer of the labellings, their poses.
 
-    The graph is contracted and cleaned again for each systematic error that all measurements of a kind may share.
+    The graph is contracted and cleaned again for each candidate of a systematic error.
     """
     with metered() as meter:
         estimate = _whole(graph, stages, run)
@@ -91,7 +91,7 @@ def _whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
         with run.watch.stage("poses"):
             poses, mode = median_poses(calibrated(graph, found.calibration), found.modes, tune)
     is_divided = bool(published.warnings) if poses is None else poses.poses.is_divided
-    # The posterior's warning concerns answers that rotations alone do not tell apart.
+    # The posterior's warning is about rivals by rotations alone; translations may have decided between them.
     told = estimate.warnings if is_divided else ()
     jumps = () if poses is None else of_jumps(poses.pose)
     estimate = replace(estimate, warnings=(*told, *notes_of(mode, found.suspected), *jumps))

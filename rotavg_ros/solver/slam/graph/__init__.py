@@ -1,1 +1,1 @@
-"""The pose graph with its odometry drawn together, and which of its closures are neighbours."""
+"""The pose graph with its odometry contracted, and which of its closures are neighbours."""

@@ -1,8 +1,8 @@
 """The closure graph: a SLAM pose graph with its odometry chains contracted.
 
-A keyframe between two odometry edges and without a closure carries no information of its own, so a run of k odometry
-steps is one *segment* with k times the variance, and what is left has as many nodes as closures have ends. All
-orientations are written as a correction of the odometry's,
+A keyframe between two odometry edges and without a closure carries no information of its own. So a run of k odometry
+steps is one *segment* with k times the variance, and only *key nodes* are left: the ends of closures, and the places
+where the odometry begins, branches or ends. All orientations are written as a correction of the odometry's,
 
     R_v = R_v⁰ C_v        (R⁰: composed along the spanning forest; C: a rotation of the world frame),
 
@@ -34,20 +34,20 @@ class ClosureGraph:
 
     Attributes:
         nodes: ``(K,)`` view-graph nodes, ascending.
-        position: ``(K,)`` odometry steps along the node's chain from its lowest end; chains lie far from each other, in
+        position: ``(K,)`` odometry steps along the node's chain from the chain's lowest end; chains are far apart, in
             the order of these ends.
         roots: ``(components,)`` key nodes whose correction stays the identity.
         source, target: ``(E,)`` key nodes.
         residual: ``(E, 4)`` float64 e⁰; the identity on segments.
         is_odometry: ``(E,)`` bool; all segments, and odometry edges outside the forest.
         own_steps: ``(E,)`` variance of each edge's own noise in units of one edge of its kind: odometry steps passed;
-            of closures 1.
-        stated_variance: ``(E,)`` rad², what closures state; NaN where unknown, and of odometry.
-        path_steps: ``(E,)`` odometry steps between the edge's ends along the forest; inf where a bridge is passed.
+            1 for closures.
+        stated_variance: ``(E,)`` rad², as stated by closures; NaN where unknown, and for odometry.
+        path_steps: ``(E,)`` odometry steps between the edge's ends along the forest; inf if a closure is passed.
         view_graph_edge: ``(E - S,)`` the view-graph edge of each edge that is no segment.
-        segment_of_edge: ``(M,)`` the segment that holds each view-graph edge, -1 for those above.
-        share_of_segment: ``(M,)`` how much of its segment's steps a view-graph edge is; 1 for those above.
-        paths: what it was drawn together along, with R⁰.
+        segment_of_edge: ``(M,)`` the segment that contains each view-graph edge; -1 for edges in none.
+        share_of_segment: ``(M,)`` share of its segment's steps that each view-graph edge has; 1 for edges in none.
+        paths: paths along the spanning forest, with R⁰.
     """
 
     nodes: np.ndarray
@@ -90,7 +90,7 @@ class ClosureGraph:
 
     @property
     def is_forward(self) -> np.ndarray:
-        """``(E,)`` bool, whether edges are stated from the older to the newer end; of those alike, the lower one."""
+        """``(E,)`` bool, whether edges are stated from the older to the newer end; if equally old, from low to high."""
         older, newer = self.position[self.source], self.position[self.target]
         return np.where(older == newer, self.source < self.target, older < newer)
 
@@ -107,12 +107,12 @@ class ClosureGraph:
     def variance(self, own: np.ndarray, apart: np.ndarray, step_variance: float) -> np.ndarray:
         """Variance of all nodes ``(N,)``, rad².
 
-        Inside a segment the error is interpolated, plus that of a random walk that is tied down at both ends.
+        Inside a segment the error is interpolated between the ends, plus a Brownian bridge.
 
         Args:
-            own: ``(K,)`` rad², of the key nodes' errors.
-            apart: ``(S,)`` rad², of the difference between those at both ends of each segment.
-            step_variance: rad², of one step of odometry.
+            own: ``(K,)`` rad², variances of the key nodes.
+            apart: ``(S,)`` rad², variance of the difference between both ends of each segment.
+            step_variance: rad², variance of one step of odometry.
         """
         across = np.zeros(self.num_nodes)
         across[self.target[: self.num_segments]] = apart
@@ -121,13 +121,13 @@ class ClosureGraph:
         return np.asarray(of_ends + rest * (self.length * step_variance - across[self.below]))
 
     def corrections(self, body_from_world: Tensor) -> Tensor:
-        """Orientations of all nodes ``(N, 4)`` → corrections of the key nodes ``(K, 4)`` that are nearest to them."""
+        """Orientations of all nodes ``(N, 4)`` → corrections of the key nodes ``(K, 4)``."""
         nodes = torch.from_numpy(self.nodes)
         relative = rotations.multiply(rotations.inverse(self.odometry_orientation[nodes]), body_from_world[nodes])
         return rotations.normalize(relative)
 
     def from_roots(self, correction: Tensor) -> Tensor:
-        """Corrections ``(K, 4)`` of the same answer, those of roots the identity."""
+        """Corrections ``(K, 4)`` in another gauge: each component turned such that its root's is the identity."""
         links = coo_array((np.ones(len(self.source)), (self.source, self.target)), shape=(len(self.nodes),) * 2)
         component = connected_components(links, directed=False)[1]
         root = np.empty(len(self.roots), dtype=np.int64)
@@ -144,21 +144,21 @@ class ClosureGraph:
         return out
 
     def passing(self, passed: np.ndarray) -> ClosureGraph:
-        """The graph in which a node lies as far along its segment as it has ``passed`` ``(N,)``, counted from roots."""
+        """The graph with nodes placed within their segments by ``passed`` ``(N,)``, counted from the roots."""
         start, end = passed[self.nodes[self.above]], passed[self.nodes[self.below]]
         length = end - start
         fraction = np.divide(passed - start, length, out=self.fraction.copy(), where=length > 0)
         return replace(self, fraction=fraction, length=length)
 
     def varying(self, relative: np.ndarray) -> ClosureGraph:
-        """The graph whose edges have ``relative`` ``(E,)`` times the variance; a segment has it all along."""
+        """The graph whose segments have ``relative`` ``(E,)`` times the variance, evenly along each."""
         of_node = np.ones(self.num_nodes)
         of_node[self.target[: self.num_segments]] = relative[: self.num_segments]
         return replace(self, length=self.length * of_node[self.below])
 
 
 def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
-    """Draw the odometry chains of ``graph`` (on the CPU) together along ``forest``."""
+    """The closure graph of ``graph`` (on the CPU), its odometry chains contracted along ``forest``."""
     paths = OdometryPaths.along(graph, forest)
     num_nodes, num_edges = graph.num_nodes, graph.num_edges
     source, target = graph.source.numpy(), graph.target.numpy()

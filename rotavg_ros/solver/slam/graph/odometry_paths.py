@@ -1,4 +1,4 @@
-"""A SLAM graph along a spanning forest: orientations, and how far each closure's ends are apart by odometry."""
+"""A SLAM graph along a spanning forest: orientations, and distances by odometry between the ends of closures."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from rotavg_ros.view_graph import ViewGraph
 
 @dataclass(frozen=True)
 class OdometryPaths:
-    """Paths along a view-graph of N nodes and M edges, of which F are closures or odometry outside the forest.
+    """Paths along a view-graph of N nodes and M edges; F of these are closures, or odometry outside the forest.
 
     Attributes:
-        forest: odometry first.
+        forest: the forest, which prefers odometry.
         orientation: ``(N, 4)`` R⁰, body_from_world composed along it.
         hangs_on_odometry: ``(N,)`` bool, whether a node's parent edge is odometry.
         depth: ``(N,)`` odometry steps from the root.
         level: ``(N,)`` edges from the root.
-        chain: ``(N,)`` the lowest end of each node's chain; equal where odometry alone connects two along the forest.
-        position: ``(N,)`` odometry steps along the chain from that end. The root may lie anywhere in it, as where a
-            closure joins it to another one: two nodes before and after that have one depth.
-        outside: ``(F,)`` edges, sorted by their ends: the answer must not depend on the order in which they arrived.
-        residual: ``(F, 4)`` of these, under R⁰.
-        path_steps: ``(F,)`` odometry steps between their ends along the forest; inf where a closure is passed.
+        chain: ``(N,)`` the lowest end of each node's chain; equal for nodes that odometry connects along the forest.
+        position: ``(N,)`` odometry steps along the chain from that end. Unlike the depth it distinguishes nodes before
+            and after the place where the chain hangs on the forest, which may be anywhere.
+        outside: ``(F,)`` edges, sorted by their ends, so that the answer does not depend on the order of arrival.
+        residual: ``(F, 4)`` their residuals under R⁰.
+        path_steps: ``(F,)`` odometry steps between their ends along the forest; inf if a closure is passed.
     """
 
     forest: SpanningForest
@@ -53,7 +53,7 @@ class OdometryPaths:
 
     @classmethod
     def along(cls, graph: ViewGraph, forest: SpanningForest) -> OdometryPaths:
-        """All of a graph on the CPU."""
+        """The paths of a graph on the CPU along a forest."""
         num_nodes, parent, parent_edge = graph.num_nodes, forest.parent, forest.parent_edge
         on_tree = np.zeros(graph.num_edges, dtype=bool)
         on_tree[parent_edge[parent_edge >= 0]] = True
@@ -79,7 +79,7 @@ class OdometryPaths:
 
 
 def runs_forward(graph: ViewGraph) -> np.ndarray:
-    """``(M,)`` bool, whether edges run from the older to the newer end by the odometry, closures by their numbers."""
+    """``(M,)`` bool, whether edges run from the older to the newer end by odometry; for closures, by node numbers."""
     source, target = graph.source.numpy(), graph.target.numpy()
     by_number = source < target
     steps = graph.is_odometry.numpy()
@@ -95,7 +95,7 @@ def runs_forward(graph: ViewGraph) -> np.ndarray:
 
 
 def odometry_ends(graph: ViewGraph) -> np.ndarray:
-    """``(N,)`` bool, the nodes that no more than one step of odometry touches: where the tree may hang from."""
+    """``(N,)`` bool, nodes that at most one odometry edge touches; the forest is rooted there."""
     steps = graph.is_odometry
     touched = torch.cat((graph.source[steps], graph.target[steps]))
     return (torch.bincount(touched, minlength=graph.num_nodes) <= 1).numpy()
@@ -103,13 +103,13 @@ def odometry_ends(graph: ViewGraph) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Growth:
-    """New nodes (n), each of which hangs on an older one by one edge of odometry.
+    """n new nodes, each attached to an older one by one odometry edge.
 
     Attributes:
-        edge: ``(n,)`` that edge, in the order of nodes.
+        edge: ``(n,)`` that edge, in the order of the nodes.
         parent: ``(n,)`` its other end.
-        anchor: ``(n,)`` the known node that the way back leads to.
-        turn: ``(n, 4)`` orientations, if anchors' were the identity.
+        anchor: ``(n,)`` the known node at which the way back ends.
+        turn: ``(n, 4)`` orientation relative to the anchor: body_from_world if the anchor's is the identity.
     """
 
     edge: np.ndarray
@@ -120,7 +120,7 @@ class Growth:
 
     @classmethod
     def of(cls, graph: ViewGraph, edge: np.ndarray, num_known: int) -> Growth | None:
-        """By new edges ``(n,)`` of odometry; None where nodes after the known ones hang otherwise."""
+        """From new odometry edges ``(n,)``; None if nodes from ``num_known`` on are not attached one by one."""
         source, target = graph.source.numpy()[edge], graph.target.numpy()[edge]
         child, parent = np.maximum(source, target), np.minimum(source, target)
         order = np.argsort(child)
@@ -132,17 +132,17 @@ class Growth:
         return cls(edge, parent, anchor, torch.from_numpy(turn), num_known)
 
     def among(self, kept: np.ndarray) -> Growth:
-        """The same in a graph of the edges ``kept`` ``(M',)`` alone, ascending, its own among these."""
+        """The same growth in the graph that has only the edges ``kept`` ``(M',)``, ascending, which include its own."""
         return replace(self, edge=np.searchsorted(kept, self.edge))
 
     def along(self, value: np.ndarray) -> np.ndarray:
-        """Sums of edges' values ``(n,)`` from the anchors on."""
+        """``(n,)`` sums of edges' values ``(n,)`` along the way from each node's anchor."""
         return _sums(self.parent, self._num_known, value)
 
 
 @compiled
 def _turns(parent: np.ndarray, known: int, measured: np.ndarray, enters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``(n,)`` and ``(n, 4)``: the known node that each new one hangs on, and how far it is turned from that, w ≥ 0."""
+    """``(n,)`` anchor of each new node, and ``(n, 4)`` its orientation relative to the anchor, w ≥ 0."""
     anchor, turn = np.empty(len(parent), dtype=np.int64), np.empty((len(parent), 4))
     for i in range(len(parent)):
         own = measured[i, 0], measured[i, 1], measured[i, 2], measured[i, 3]
@@ -159,7 +159,7 @@ def _turns(parent: np.ndarray, known: int, measured: np.ndarray, enters: np.ndar
 
 @compiled
 def _sums(parent: np.ndarray, known: int, value: np.ndarray) -> np.ndarray:
-    """``(n,)`` of new nodes, of what each adds to its parent's."""
+    """``(n,)`` sums of values along the way from each new node's anchor."""
     total = np.empty(len(value))
     for i in range(len(value)):
         above = parent[i] - known
@@ -170,14 +170,14 @@ def _sums(parent: np.ndarray, known: int, value: np.ndarray) -> np.ndarray:
 
 
 def _canonical_order(graph: ViewGraph, edges: np.ndarray) -> np.ndarray:
-    """By their ends, parallels by angle."""
+    """Order of edges by their ends; parallel edges by their angle."""
     source, target = graph.source.numpy()[edges], graph.target.numpy()[edges]
     cosine = graph.target_from_source[:, 3].numpy()[edges]
     return np.lexsort((cosine, np.maximum(source, target), np.minimum(source, target)))
 
 
 def _lowest_ends(parent: np.ndarray, top: np.ndarray) -> np.ndarray:
-    """``(N,)`` of each node's chain, whose top is where it hangs on the forest."""
+    """``(N,)`` lowest end of each node's chain, given the chain's top, where it hangs on the forest."""
     node = np.arange(len(parent))
     hangs = top != node
     is_end = hangs + np.bincount(parent[hangs], minlength=len(node)) <= 1
@@ -189,7 +189,7 @@ def _lowest_ends(parent: np.ndarray, top: np.ndarray) -> np.ndarray:
 def _position(
     parent: np.ndarray, depth: np.ndarray, level: np.ndarray, top: np.ndarray, lowest: np.ndarray
 ) -> np.ndarray:
-    """``(N,)`` steps from the lowest end of each node's chain; of one that branches, branches go on side by side."""
+    """``(N,)`` steps from the lowest end of each node's chain; branches of a chain overlap in position."""
     position = depth - depth[top]
     (other,) = np.nonzero(lowest != top)
     if len(other):
@@ -198,6 +198,6 @@ def _position(
 
 
 def _path_length(parent: np.ndarray, depth: np.ndarray, level: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Length of the ways between nodes of the same tree, by way of their lowest common ancestor."""
+    """Number of steps between nodes a and b of the same tree, by their lowest common ancestor."""
     ancestor = lowest_common_ancestors(parent, level, a, b)
     return np.asarray(depth[a] + depth[b] - 2 * depth[ancestor])

@@ -1,7 +1,7 @@
 """Measurements that a graph states more than once.
 
-Exporters write an edge again for every message it came in, and a sender repeats what it is not sure was heard. Taken
-for independent, an odometry edge that is there twice seems free of noise, and copies of a false closure confirm each
+Exporters write an edge again for every message it came in, and senders repeat what may not have been received. Taken
+for independent measurements, a repeated odometry edge seems free of noise, and copies of a false closure confirm each
 other.
 """
 
@@ -15,22 +15,23 @@ import torch
 from rotavg_ros import rotations
 from rotavg_ros.view_graph import ViewGraph
 
-# What a measurement differs by from its copy in the other direction where a file gives six digits of both: products of
-# the quaternion's components, and metres and a share of the translation's length. Independent ones differ by more.
+# Largest difference of a measurement from its copy in the other direction, if a file gives six digits of both: products
+# of the quaternion's components, and metres plus a share of the translation's length. Independent measurements differ
+# by more.
 _ROTATION, _SHIFT, _SHARE_OF_LENGTH = 1e-5, 5e-6, 1e-5
-# Edges between the same nodes are sorted along a direction in which different measurements hardly ever fall together.
+# Edges between the same nodes are sorted along this direction, in which different measurements hardly ever coincide.
 _DIRECTION = np.sqrt(np.arange(2.0, 15.0))
 
 
 def first_of_each(graph: ViewGraph) -> tuple[np.ndarray, np.ndarray] | None:
-    """The edges that say something new, and which of these says the same as each edge.
+    """The edges that state something new, and for each edge the one of these that states the same.
 
-    Two edges say the same if they are of one kind and label, between the same nodes, and measure the same
-    rotation and translation, to rounding: exporters that write every edge both ways compute one from the other and give
-    six digits of each. One without a translation differs from one with.
+    Two edges state the same if they have one kind, label and number of steps, connect the same nodes, and measure the
+    same rotation and translation, up to rounding: exporters that write every edge both ways compute one from the other
+    and give six digits of each. An edge without a translation differs from one with a translation.
 
     Returns:
-        ``(U,)`` edges, ascending, and ``(M,)`` numbers in 0 … U-1; None if there are no repetitions.
+        ``(U,)`` edges, ascending, and ``(M,)`` numbers in 0 … U − 1; None if no edge repeats another one.
     """
     source, target = graph.source.numpy(), graph.target.numpy()
     pair = np.minimum(source, target) * np.int64(graph.num_nodes) + np.maximum(source, target)
@@ -76,7 +77,7 @@ def without_repeats(graph: ViewGraph, first: np.ndarray, says_as: np.ndarray) ->
 
 
 def repeats_since(graph: ViewGraph, count: int) -> bool:
-    """Whether edges from ``count`` on say again what any edge says, in a graph whose first ones repeat nothing."""
+    """Whether edges from number ``count`` on repeat any edge, in a graph whose first ``count`` edges repeat none."""
     source, target = graph.source.numpy(), graph.target.numpy()
     touched = np.zeros(graph.num_nodes, dtype=bool)
     touched[source[count:]] = touched[target[count:]] = True

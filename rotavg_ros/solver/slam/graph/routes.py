@@ -1,4 +1,4 @@
-"""Where edges lead, and what odometry did along those that several of its steps were drawn together into."""
+"""Displacements of edges, and the routes of odometry edges that several steps were merged into."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from rotavg_ros.view_graph import ViewGraph
 
 
 def routes_of(graph: ViewGraph, edge: np.ndarray, older: np.ndarray) -> Routes:
-    """As edges state it; of those that do not, steps are all alike.
+    """Routes of odometry edges as stated; edges that state none get one with equal steps.
 
     Args:
-        graph: whose edges.
-        edge: ``(n,)`` their numbers.
-        older: ``(n,)`` the end of each where odometry came from. Routes are stated from the lower one.
+        graph: the graph.
+        edge: ``(n,)`` edges.
+        older: ``(n,)`` the older end of each. Routes are stated from the end with the lower number, so they are used
+            only where that is the older one.
     """
     some = torch.from_numpy(edge)
     displacement = np.zeros((len(edge), 3))
@@ -33,25 +34,25 @@ def routes_of(graph: ViewGraph, edge: np.ndarray, older: np.ndarray) -> Routes:
 
 
 def ways_by(graph: ViewGraph, edge: np.ndarray, translation: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """``(n, 3)`` metres from source to target of edges ``(n,)``, by the axes of one of their ends.
+    """``(n, 3)`` metres from source to target of edges ``(n,)``, in the axes of one of their ends.
 
     Args:
-        graph: whose edges.
-        edge: ``(n,)`` their numbers.
-        translation: ``(n, 3)`` metres, as they are stated.
-        at: ``(n,)`` that end.
+        graph: the graph.
+        edge: ``(n,)`` edges.
+        translation: ``(n, 3)`` metres, in the source's axes.
+        at: ``(n,)`` the end whose axes are used.
     """
     turned = rotations.rotate(graph.target_from_source[edge].double(), torch.from_numpy(translation)).numpy()
     return np.where((graph.source.numpy()[edge] == at)[:, None], translation, turned)
 
 
 def turned_along(graph: ViewGraph) -> np.ndarray | None:
-    """``(M,)`` rad², sums of the squares of the steps' turns; NaN where unknown."""
+    """``(M,)`` rad², sum of the squared turns of each edge's steps; NaN where unknown. None if no edge states it."""
     return _column(graph, 0)
 
 
 def way_along(graph: ViewGraph) -> np.ndarray | None:
-    """``(M,)`` metres, along the steps; NaN where unknown."""
+    """``(M,)`` metres, length of each edge along its steps; NaN where unknown. None if no edge states it."""
     return _column(graph, 1)
 
 

@@ -1,7 +1,7 @@
 """The density of other false closures at the turn of each: kernel estimates over those detected before, or all.
 
 Places that look alike are mistaken for each other repeatedly. There are separate estimates for closures of the same
-run, for those detected shortly before, and for all: a run that begins repeats nothing, whatever the last one did.
+run, for those detected shortly before, and for all, since a run that begins need not repeat the turn of the last one.
 Within a run, a place that was mistaken for another one is mistaken again; seen from the other place, by the inverse
 turn.
 """
@@ -110,8 +110,8 @@ def places_near(when: np.ndarray, asked: np.ndarray, is_one: np.ndarray | None, 
     Args:
         when: ``(F,)`` when the closures were detected, ascending.
         asked: ``(n,)`` when the others were detected.
-        is_one: ``(n,)`` bool, which of the others are among the closures, since none is near itself; None: only those
-            before.
+        is_one: ``(n,)`` bool, which of the others are themselves among the closures, to exclude them; None: consider
+            only closures detected before.
         window: largest number before, and after.
     """
     earlier = np.searchsorted(when, asked)
