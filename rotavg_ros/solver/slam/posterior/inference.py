@@ -79,7 +79,7 @@ class Search:
         if self.modes:
             best = self.modes[0]
             state = step(self.problem, with_noise(self.problem, state, best.state.noise)).state
-            if best.is_turned_like(state):  # and labels follow from orientations
+            if best.is_turned_like(state):  # labels follow from orientations
                 return best
             mode = self.flipped(self.polished(state, name))
             self.keep(mode)

@@ -1,9 +1,9 @@
-"""Turning whole parts of a closure graph at once, where no small step leads to a better solution.
+"""Turns whole parts of a closure graph at once, where no small step leads to a better solution.
 
 If odometry slipped, everything after the slip is turned by the same rotation. A *jump* takes the residual of one wrong
-edge and turns the best set of nodes by it: which nodes go along is a minimum cut, since every edge between those that
-do and those that do not pays or gains. (The expansion moves of Boykov, Veksler & Zabih 2001, with a rotation for a
-label; where such a move is not submodular, its cost is taken from above, so an accepted jump is an improvement.)
+edge and turns the best set of nodes by it. That set is a minimum cut, since every edge between a turned and an unturned
+node changes its cost. (The expansion moves of Boykov, Veksler & Zabih 2001, with a rotation for a label; where such a
+move is not submodular, its cost is bounded from above, so an accepted jump is an improvement.)
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _MIN_CARRIED = 1e-6
 
 
 def jump_to_optimum(cost: TruncatedCost, correction: Tensor, pairs: AgreementPairs, is_agreed: np.ndarray) -> Tensor:
-    """Jumps and descents in turn until neither helps; corrections ``(K, 4)``.
+    """Alternates jumps and descents until neither helps; corrections ``(K, 4)``.
 
     Args:
         correction: ``(K, 4)`` start.
@@ -50,12 +50,12 @@ class _Jumps:
 
     def __init__(self, cost: TruncatedCost, pairs: AgreementPairs, is_agreed: np.ndarray) -> None:
         self._cost, self._pairs, self._is_agreed = cost, pairs, is_agreed
-        # For every edge whose jump gained nothing, the upper bound of its gain at that time.
+        # ``(E,)`` nats, bound on the gain of each edge's jump when it was last tried without success.
         self._hopeless = np.zeros(len(cost.cap))
         self._network = FlowNetwork(cost.graph.num_nodes, cost.graph.source, cost.graph.target)
 
     def one_round(self, correction: Tensor) -> tuple[Tensor, float]:
-        """One jump by each wrong edge that still is one when its turn comes; corrections and the cost saved."""
+        """Tries the jump of each edge that is still wrong in its turn; corrections ``(K, 4)``, and the gain in nats."""
         cost, hopeless = self._cost, self._hopeless
         residual = cost.residual(correction)
         costs = cost.of_edges(residual)
@@ -84,7 +84,7 @@ class _Jumps:
             if len(moved) in (0, cost.graph.num_nodes):
                 continue
             tried = correction.clone()
-            # Norms multiply with every jump; rounding errors would, too.
+            # Normalised, since every jump would multiply the rounding errors of the norms.
             tried[moved] = rotations.normalize(
                 rotations.multiply(correction[moved], residual[edge].expand(len(moved), 4))
             )
@@ -99,7 +99,7 @@ class _Jumps:
 
 
 def _candidates(cost: TruncatedCost, costs: np.ndarray, pairs: AgreementPairs, is_agreed: np.ndarray) -> np.ndarray:
-    """Wrong segments, and the best supported one of every group of wrong closures that agree with each other."""
+    """Wrong segments, and the closure with most agreeing ones from each group of wrong closures that agree."""
     closure = np.flatnonzero(cost.graph.is_closure)
     is_wrong = (costs > 0.5 * cost.cap) & (cost.cap > 0)
     wrong = is_wrong[closure]
@@ -119,7 +119,14 @@ def _candidates(cost: TruncatedCost, costs: np.ndarray, pairs: AgreementPairs, i
 
 
 def turns(cost: TruncatedCost, residual: Tensor, turns: Tensor, costs: np.ndarray) -> TwoLabels:
-    """Which nodes to turn by each of ``turns`` ``(Q, 4)``; residuals ``(E, 4)`` and costs ``(E,)`` as they are now."""
+    """The minimum-cut problems for turning nodes by each of ``turns`` ``(Q, 4)``.
+
+    Args:
+        cost: the cost.
+        residual: ``(E, 4)`` current residuals.
+        turns: ``(Q, 4)`` turns.
+        costs: ``(E,)`` current costs.
+    """
     graph = cost.graph
     # Real parts of turn⁻¹ ∘ residual and of residual ∘ turn.
     if_target = cost.of_cosines(residual @ turns.T)

@@ -1,4 +1,4 @@
-"""Other noise for the same labels: belief in stated precisions, common errors of closures, their length, and tails."""
+"""Moves that change the noise for the same labels: exponent of stated precisions, common errors, run length, tails."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from rotavg_ros.solver.slam.posterior.state import (
 )
 
 _Values = tuple[float, ...]
-# What odometry's tails may be.
+# Shares and variance ratios of odometry's tails, if it has any.
 STEP_TAILS = tuple(product(TAIL_SHARES[1:], STEP_TAIL_RATIOS))
-# What is chosen together, and its values.
+# The grids of values that are chosen together.
 _GRIDS: dict[tuple[str, ...], tuple[_Values, ...]] = {
     ("turn_share",): tuple(product(TURN_SHARES)),
     ("step_tails", "step_tail_ratio"): ((TAIL_SHARES[0], STEP_TAIL_RATIOS[0]), *STEP_TAILS),
@@ -37,11 +37,11 @@ _GRIDS: dict[tuple[str, ...], tuple[_Values, ...]] = {
     ("run_steps",): tuple(product(RUN_STEPS)),
     ("common_share",): tuple(product(COMMON_SHARES)),
 }
-# Where the logarithms of stated variances spread by less, weights could gain 4 % of variance at most.
+# If the logarithms of stated variances spread by less, weighting by them lowers the variance by at most 4 %.
 _MIN_SPREAD = 0.2
-# What errors have in common is no matter of single edges.
+# Values whose effect on F is not predicted: common errors are not a property of single edges.
 _JOINT = (("run_steps",), ("common_share",))
-# By what a variance changes when other noise is believed, at most and in steps.
+# Factors of a variance that are tried in predicting F under other noise.
 SCALES = np.exp(np.linspace(-3.6, 1.2, 25))
 # Labels are also settled starting from a variance of odometry's steps that is this many times as large.
 _WORSE_STEPS = 4.0
@@ -50,7 +50,7 @@ _FIRST_SOLVES = 2
 
 
 def tuned(mode: Mode) -> Iterator[Mode]:
-    """Modes of the same labels with other noise: values of one grid after the other, from the best so far."""
+    """Modes of the same labels under other noise: one grid after the other, each from the best noise so far."""
     begun = mode
     for names, grid in _GRIDS.items():
         if not _tells(mode, names[0]):
@@ -69,10 +69,10 @@ def tuned(mode: Mode) -> Iterator[Mode]:
 
 
 def propose_worse_odometry(mode: Mode) -> Iterator[Proposal]:
-    """Labels settled from odometry that errs twice as much, where that leaves any open.
+    """Proposes to settle labels from odometry that errs twice as much, if that leaves any label undecided.
 
-    Odometry that is held for better than it is makes those closures false that would tell; without these it seems as
-    good as it is held for. No single label leads out of that while noise stays.
+    If odometry's variance is underestimated, the closures that would reveal it are labelled false, and without them the
+    low variance seems right. Flipping single labels under that noise does not lead out of this.
     """
     problem, noise = mode.problem, mode.state.noise
     if _opens_labels(mode, _WORSE_STEPS):
@@ -81,7 +81,7 @@ def propose_worse_odometry(mode: Mode) -> Iterator[Proposal]:
 
 
 def _opens_labels(mode: Mode, factor: float) -> bool:
-    """Whether a closure's label, decided now, would be open if its prediction had ``factor`` times the variance."""
+    """Whether some decided label would be undecided if its prediction had ``factor`` times the variance."""
     problem, told, closure = mode.problem, mode.left_out, mode.problem.closure
     noise = mode.state.noise
     own, tailed = variances(problem, noise)[closure], tails(problem, noise).of(closure)
@@ -100,15 +100,17 @@ def _values(mode: Mode, names: tuple[str, ...]) -> _Values:
 
 
 def _is_open(problem: Problem, names: tuple[str, ...], values: _Values) -> bool:
+    """Whether a combination of values is switched on."""
     is_wide = "step_tail_ratio" in names and values[-1] > STEP_TAIL_RATIOS[0]
     return not (is_wide and "wide-tails" in problem.without)
 
 
 def _next(mode: Mode, names: tuple[str, ...], left: list[_Values]) -> tuple[_Values, Noise] | None:
-    """Which of some values is to be tried, and the noise to begin with; None if none may pay.
+    """The values to try next, and the noise to begin with; None if none is promising.
 
-    Of what is a matter of single edges, that for which F is predicted to be least. Where none is predicted to pay,
-    tails next to those that there are: other tails change what others say of each edge by more than is predicted.
+    Values that act on single edges are tried in the order of the predicted F, while it rises by no more than the slack.
+    If none qualifies, tails adjacent to the current ones on the grid are tried: other tails change the prediction of
+    each edge, which the predicted F neglects.
     """
     noise = {values: replace(mode.state.noise, **dict(zip(names, values, strict=True))) for values in left}
     if names in _JOINT:
@@ -123,7 +125,7 @@ def _next(mode: Mode, names: tuple[str, ...], left: list[_Values]) -> tuple[_Val
 
 
 def _are_next(some: _Values, others: _Values) -> bool:
-    """Whether tails differ by their share alone, or by one place of the grid of ratios alone."""
+    """Whether two tails, both present, differ only in their share, or only by one place of the grid of ratios."""
     if len(some) < 2 or min(some[0], others[0]) == 0:
         return False
     places = abs(STEP_TAIL_RATIOS.index(some[1]) - STEP_TAIL_RATIOS.index(others[1]))
@@ -131,12 +133,12 @@ def _are_next(some: _Values, others: _Values) -> bool:
 
 
 def _predicted(mode: Mode, noise: Noise) -> tuple[float, Noise]:
-    """By how much F changes, nats, if what others say of each edge stays, and each kind has its best variance.
+    """Predicted change of F under other noise, if all other edges predict each edge as before.
 
-    At the optimum that is the slope of F along the noise.
+    At the optimum this is exact to first order in the change of noise.
 
     Returns:
-        nats, and the noise with these variances.
+        nats, and the noise with the best variance of each kind of edge.
     """
     problem, told, good = mode.problem, mode.left_out, mode.state.is_good
     before, k = mode.state.noise, problem.components
@@ -156,13 +158,13 @@ def _predicted(mode: Mode, noise: Noise) -> tuple[float, Noise]:
 
 
 def uneven(problem: Problem, noise: Noise) -> Noise:
-    """The same but for odometry that errs by more now and then, and where it turns."""
+    """The noise with some odometry in the tails and with errors partly proportional to turns, where these are open."""
     tailed = noise.step_tails if "tails" in problem.without else TAIL_SHARES[1]
     return replace(noise, step_tails=tailed, turn_share=TURN_SHARES[1] if problem.turns_vary else noise.turn_share)
 
 
 def _tried(mode: Mode, noise: Noise) -> Mode:
-    """The mode's labels under other noise; given up after a few solves where F is far above the mode's."""
+    """The mode's labels under other noise; not polished to the end if F is far above the mode's after a few solves."""
     limits = mode.problem.limits
     found = _polished(mode, noise, _FIRST_SOLVES)
     if found.cost > mode.cost + limits.rival:
@@ -176,7 +178,7 @@ def _polished(mode: Mode, noise: Noise, solves: int | None = None) -> Mode:
 
 
 def _tells(mode: Mode, name: str) -> bool:
-    """Whether the graph has anything to say of it."""
+    """Whether the graph has information on a parameter of the noise, and it is not switched off."""
     if name == "turn_share":
         return mode.problem.turns_vary
     if name in ("step_tails", "closure_tails"):

@@ -1,7 +1,7 @@
-"""Reject a whole run: good closures that support each other although all else contradicts them.
+"""Moves that reject a whole run: good closures that support each other although all other edges contradict them.
 
-For K closures of a run with residuals r, variances V (diagonal) and covariance R of their fitted values, all else
-predicts their discrepancies y without them as N(0, S):
+For K closures of a run with residuals r, variances V (diagonal) and covariance R of their fitted values, all other
+edges predict their discrepancies y as N(0, S):
 
     y = V (V − R)⁻¹ r,    S = V (V − R)⁻¹ V.
 """
@@ -21,12 +21,12 @@ from rotavg_ros.solver.slam.posterior.moves.slips import SETTLING, log_labelled
 from rotavg_ros.solver.slam.posterior.rows import variances
 from rotavg_ros.solver.slam.posterior.state import State
 
-# Least number of good closures of a run.
+# Least number of good closures in a run.
 _LEAST_MEMBERS = 2
 
 
 def propose_rejected_runs(mode: Mode) -> Iterator[Proposal]:
-    """Proposals to reject the runs of good closures that pull most against all else."""
+    """Proposes to reject the runs of good closures whose residuals have the largest common part."""
     problem, limits = mode.problem, mode.problem.limits
     runs = _runs(mode)[: limits.slips]
     if not runs:
@@ -44,7 +44,7 @@ def propose_rejected_runs(mode: Mode) -> Iterator[Proposal]:
 
 
 def _runs(mode: Mode) -> list[np.ndarray]:
-    """Members ``(K,)`` of each, those first that are off alike by most standard deviations."""
+    """Good closures ``(K,)`` of each run, the run whose summed residual is the most standard deviations first."""
     problem, is_good = mode.problem, ~mode.is_false & ~np.isinf(mode.problem.log_odds[mode.problem.closure])
     own = variances(problem, mode.state.noise)[problem.closure]
     off = mode.evaluation.residual[problem.closure] * (problem.sign * is_good)[:, None]
@@ -56,7 +56,10 @@ def _runs(mode: Mode) -> list[np.ndarray]:
 
 
 def _without(mode: Mode, members: np.ndarray) -> tuple[float, np.ndarray] | None:
-    """Log density of members by all other edges, and their discrepancies ``(K, 3)``; None if nothing tells of some."""
+    """Log density of K closures as all other edges predict them, and their discrepancies ``(K, 3)`` rad.
+
+    None if the other edges do not determine the prediction.
+    """
     problem, k = mode.problem, mode.problem.components
     rows, sign = problem.closure[members], problem.sign[members, None]
     own = variances(problem, mode.state.noise)[rows]
@@ -65,7 +68,7 @@ def _without(mode: Mode, members: np.ndarray) -> tuple[float, np.ndarray] | None
         factor = np.linalg.cholesky(left)
     except np.linalg.LinAlgError:
         return None
-    # By rounding there may be a factor where members are all that joins two parts; what it gives is beyond any turn.
+    # If members alone join two parts, rounding may still allow a factor; its discrepancies then exceed any rotation.
     log_det_left = 2 * float(np.log(np.diagonal(factor)).sum())
     residual = mode.evaluation.residual[rows] * sign
     solved = cho_solve((factor, True), residual)

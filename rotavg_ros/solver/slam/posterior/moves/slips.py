@@ -1,4 +1,4 @@
-"""Let odometry slip where one turn explains closures that are held false, or take a slip back."""
+"""Moves that let odometry slip where one turn explains false closures, or that take a slip back or shift it."""
 
 from __future__ import annotations
 
@@ -18,30 +18,31 @@ from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.rows import variances
 from rotavg_ros.solver.slam.posterior.state import State
 
+# Number of solves of a move's settling.
 SETTLING = 4
-# What relabelling and bending may gain beyond what residuals tell of a part that is turned back, nats.
+# Decrease of F, nats, that relabelling and bending may at most add to what the turned-back residuals predict.
 OPTIMISM = 10.0
 # A turn explains a closure whose error differs from it by at most this many standard deviations, or this angle, rad.
 _AGREE, _AGREE_ANGLE = 3.0, np.radians(2.0)
-# One false closure costs less than a slip.
+# Least number of false closures for a slip: a single one costs less than a slip.
 LEAST_WITNESSES = 2
-# Largest number of segments by which a slip is moved.
+# Largest number of segments by which a slip is shifted.
 _FARTHEST_SHIFT = 8
-# Positions that differ by less, in steps, are the same.
+# Positions along the path that differ by less than this, in steps, are the same.
 SAME_PLACE = 1e-9
 
 
 @dataclass(frozen=True)
 class Witnesses:
-    """What closures say of slips (C closures, S sound segments in the order of the path).
+    """Evidence from C closures on slips of S sound segments, which are sorted along the path.
 
     Attributes:
-        turned: ``(4, C)`` residuals, from older to newer end.
-        can_tell: ``(C,)`` bool, one chain of odometry has both ends.
-        first, last: ``(C,)`` segments that each lies across: first ≤ s < last.
-        gain: ``(C,)`` nats, what each gains by itself if it comes out good.
+        turned: ``(4, C)`` residuals of the closures, from older to newer end.
+        can_tell: ``(C,)`` bool, whether one chain of odometry has both ends.
+        first, last: ``(C,)`` segments that each closure spans: first ≤ s < last.
+        gain: ``(C,)`` nats that each closure gains by being good, relative to being false on its own.
         segment: ``(S,)`` edges.
-        price: ``(S,)`` nats, what a slip of each costs by itself.
+        price: ``(S,)`` nats, cost of a slip in each on its own.
     """
 
     turned: np.ndarray
@@ -70,13 +71,18 @@ class Witnesses:
         return cls(turned, can_tell, first, last, gain, segment, mode.left_out.log_odds[segment])
 
     def agreeing(self, turn: np.ndarray, mode: Mode) -> np.ndarray:
-        """``(C,)`` bool, false closures that are off by about a turn ``(4,)``."""
+        """``(C,)`` bool, false closures whose error is about ``turn`` ``(4,)``."""
         tolerance = 2 * _AGREE**2 * mode.problem.components * mode.state.noise.closure_variance + _AGREE_ANGLE**2
         difference = 2 * np.arccos(np.minimum(np.abs(turn @ self.turned), 1.0))
         return np.asarray((difference**2 < tolerance) & self.can_tell & mode.is_false)
 
     def best_place(self, agrees: np.ndarray, disagrees: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
-        """Where a slip gains most, which closures ``(C,)`` it makes good, and which it turns away."""
+        """Index of the segment where a slip gains most; ``(C,)`` bool, closures it makes good, and ones it makes false.
+
+        Args:
+            agrees: ``(C,)`` bool, closures that the turn would make good if they span the slip.
+            disagrees: ``(C,)`` bool, closures that it would make false.
+        """
         change = np.where(agrees, self.gain, np.where(disagrees, -self.gain, 0.0))
         across = np.zeros(len(self.segment) + 1)
         np.add.at(across, self.first, change)
@@ -87,26 +93,26 @@ class Witnesses:
 
 
 def propose_slips(mode: Mode) -> Iterator[Proposal]:
-    """Segments where a turn would explain most of the closures that are held false."""
+    """Proposes slips where one turn makes at least two false closures good."""
     witnesses = Witnesses.of(mode)
     places = _places(mode, witnesses)[: mode.problem.limits.slips]
     before = log_labelled(mode, mode.is_false) if places else 0.0
     for _, closure, place, freed, lost in places:
         edge, turn = int(witnesses.segment[place]), witnesses.turned[:, [closure]]
-        # Together they gain less than one by one: false closures that repeat a turn are cheap.
+        # Jointly the closures gain less than one by one, since false closures that repeat a turn are cheap.
         labelled = log_labelled(mode, mode.is_false & ~freed)
         labelled += _log_turned(mode, np.flatnonzero(freed), turn, witnesses.turned[:, freed])
         labelled += float(log_slip_odds(mode.problem, mode.problem.graph.own_steps[[edge]], len(mode.slipped))[0])
         predicted = before - labelled + float(witnesses.gain[lost].sum())
-        # A slip turns a part of the map, so it is tried where it would be a rival only.
+        # A slip turns a part of the map, so one that is merely a rival of the best labelling is tried, too.
         yield Proposal("slip", predicted, partial(_with_slip, mode, edge, turn), mode.problem.limits.rival)
 
 
 def may_have_slipped(mode: Mode) -> bool:
-    """Whether some slip would pay if the closures that it explains did not repeat each other.
+    """Whether some slip would lower F if the closures that it explains did not repeat each other.
 
-    Of several slips none need pay by itself while the closures that tell of the others are held false: those repeat
-    each other and are cheap.
+    With several slips, none need lower F alone: the closures that reveal the others are still labelled false, and they
+    are cheap because they repeat each other's turn.
     """
     return any(gained > 0 for gained, *_ in _places(mode, Witnesses.of(mode))) or any(
         slip.predicted <= slip.slack for slip in propose_slips(mode)
@@ -114,9 +120,11 @@ def may_have_slipped(mode: Mode) -> bool:
 
 
 def _places(mode: Mode, witnesses: Witnesses) -> list[tuple[float, int, int, np.ndarray, np.ndarray]]:
-    """Slips by what each gains, nats, closure by closure: a closure with its turn, the place, whom it frees and loses.
+    """Candidate slips, by predicted gain, the largest first.
 
-    The most gain first.
+    Returns:
+        For each: gain in nats, each closure counted independently; the closure whose residual is the turn; index of the
+        segment; ``(C,)`` bool, closures it makes good, and those it makes false.
     """
     left, found = witnesses.can_tell & mode.is_false, []
     disagrees = witnesses.can_tell & ~mode.is_false
@@ -132,12 +140,13 @@ def _places(mode: Mode, witnesses: Witnesses) -> list[tuple[float, int, int, np.
 
 
 def _log_turned(mode: Mode, members: np.ndarray, turn: np.ndarray, turned: np.ndarray) -> float:
-    """Log density of K false closures if they are good and one slip turned all of them by about ``turn``.
+    """Log density, nats, of K false closures if they are good and one slip turned all of them by about ``turn``.
 
-    What is left without the turn is small: between rotations by nearly half a turn the differences of vectors are up to
-    π/2 times as long as those that noise makes.
+    The turn is removed before logarithms are taken: near half a turn, differences of rotation vectors are up to π/2
+    times as long as the rotations between them.
 
     Args:
+        mode: the labelling at its optimum.
         members: ``(K,)`` closures.
         turn: ``(4, 1)``.
         turned: ``(4, K)`` their residuals, from older to newer end.
@@ -154,12 +163,12 @@ def _log_turned(mode: Mode, members: np.ndarray, turn: np.ndarray, turned: np.nd
 
 
 def log_labelled(mode: Mode, is_false: np.ndarray, residual: np.ndarray | None = None) -> float:
-    """Log density of false closures and of all labels.
+    """Log density, nats, of the false closures and of all labels.
 
     Args:
-        mode: at its optimum.
+        mode: the labelling at its optimum.
         is_false: ``(C,)`` bool, labels.
-        residual: ``(C, 3)`` rad; default: as they are.
+        residual: ``(C, 3)`` rad, from source to target; default: those of ``mode``.
     """
     problem = mode.problem
     residual = mode.evaluation.residual[problem.closure] if residual is None else residual
@@ -169,7 +178,7 @@ def log_labelled(mode: Mode, is_false: np.ndarray, residual: np.ndarray | None =
 
 
 def propose_mending(mode: Mode) -> Iterator[Proposal]:
-    """Take back each slip: with all that follows, up to the next slip, or bending what is between."""
+    """Proposes to take each slip back: turn all behind it, or the part up to the next slip, or let odometry bend."""
     slipped = mode.slipped
     before, slack = rough_cost(mode.problem, mode.state), mode.problem.limits.slack
     for number, edge in enumerate(slipped[: mode.problem.limits.slips]):
@@ -184,10 +193,10 @@ def propose_mending(mode: Mode) -> Iterator[Proposal]:
 
 
 def propose_shifts(mode: Mode) -> Iterator[Proposal]:
-    """Move each slip to a sound segment of its chain near it, before or after.
+    """Proposes to shift each slip to a sound segment of its chain, up to ``_FARTHEST_SHIFT`` before or after it.
 
-    Not to the next ones alone: a closure between two segments may speak against the nearer one, and rivals are to be
-    there for places, which rotations do not know, to choose from.
+    Not only to the adjacent ones: a closure between two segments may contradict the nearer one. Also, places, which
+    rotations do not know, may later choose among these rivals.
     """
     graph, limits = mode.problem.graph, mode.problem.limits
     segment = np.flatnonzero(graph.is_odometry[: graph.num_segments])
@@ -207,7 +216,7 @@ def propose_shifts(mode: Mode) -> Iterator[Proposal]:
 
 
 def after(mode: Mode, edge: int) -> np.ndarray:
-    """``(K,)`` bool, all that follows a segment along its chain."""
+    """``(K,)`` bool, the key nodes that follow a segment along its chain."""
     graph = mode.problem.graph
     chain = graph.paths.chain[graph.nodes]
     end = max(graph.position[graph.source[edge]], graph.position[graph.target[edge]])
@@ -215,7 +224,7 @@ def after(mode: Mode, edge: int) -> np.ndarray:
 
 
 def turned_by(mode: Mode, nodes: np.ndarray, turn: np.ndarray) -> State:
-    """Nodes turned by ``turn`` ``(4, 1)``."""
+    """The mode's state with some key nodes, ``(K,)`` bool, turned by ``turn`` ``(4, 1)``."""
     correction = mode.state.correction.copy()
     correction[:, nodes] = quaternion_rows.multiply(correction[:, nodes], turn)
     return replace(mode.state, correction=correction)
@@ -231,7 +240,7 @@ def _with_slip(mode: Mode, edge: int, turn: np.ndarray) -> State:
 
 
 def _turn_of(mode: Mode, edge: int) -> np.ndarray:
-    """``(4, 1)`` by which what follows a segment is to be turned if it did not slip."""
+    """``(4, 1)`` turn of everything behind a segment that makes the segment's residual zero."""
     graph, pair = mode.problem.graph, np.array([edge])
     turn = quaternion_rows.residual(
         mode.state.correction, mode.problem.measured[:, pair], graph.source[pair], graph.target[pair]

@@ -1,7 +1,7 @@
-"""Turn the part between a slip and another place: for a slip that was in fact two, or many segments away.
+"""Moves that turn the part between a slip and another segment: one slip was in fact two, or is many segments away.
 
-The parts beyond both are already right. So no turn of all that follows a place explains the closures from the part in
-between, and no single slip gains from them.
+The parts beyond both ends are already right. So turning everything behind a segment does not explain the closures from
+the part in between, and no single slip gains from them.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from rotavg_ros.solver.slam.posterior.state import State
 
 @dataclass(frozen=True)
 class _Part:
-    """What lies between a slip and a sound segment before or after it.
+    """The part between a slip and a sound segment before or after it.
 
     Attributes:
-        gained: nats, closure by closure, less what a slip of that segment costs.
+        gained: nats, each closure counted independently, minus the cost of a slip in that segment.
         slip, segment: edges.
-        turn: ``(4, 1)``.
+        turn: ``(4, 1)`` by which the part is to be turned.
     """
 
     gained: float
@@ -46,11 +46,11 @@ class _Part:
 
 
 class _Group(NamedTuple):
-    """False closures that agree.
+    """False closures that one turn or its inverse explains.
 
     Attributes:
-        turn, inverse: ``(4, 1)`` by which the first of them is off, and back.
-        off, back: ``(C,)`` bool, which of all are off by the one and by the other.
+        turn, inverse: ``(4, 1)`` error of the first of them, and its inverse.
+        off, back: ``(C,)`` bool, closures whose error is about the turn, and those whose error is about its inverse.
     """
 
     turn: np.ndarray
@@ -60,7 +60,7 @@ class _Group(NamedTuple):
 
 
 def propose_splits(mode: Mode) -> Iterator[Proposal]:
-    """Parts beside slips that one turn puts right, those that gain most closure by closure."""
+    """Proposes to turn parts beside slips, those with the largest gain first."""
     slipped = mode.slipped[mode.slipped < mode.problem.graph.num_segments]
     if len(slipped) == 0 or mode.is_false.sum() < LEAST_WITNESSES:
         return
@@ -74,7 +74,7 @@ def propose_splits(mode: Mode) -> Iterator[Proposal]:
 
 
 def _groups(mode: Mode, witnesses: Witnesses) -> Iterator[_Group]:
-    """Groups of closures held false that one turn or its inverse explains."""
+    """Groups of at least two false closures that one turn or its inverse explains."""
     left = witnesses.can_tell & mode.is_false
     for number in np.flatnonzero(left):
         if left[number]:
@@ -87,7 +87,7 @@ def _groups(mode: Mode, witnesses: Witnesses) -> Iterator[_Group]:
 
 
 def _parts(mode: Mode, witnesses: Witnesses, groups: list[_Group], slip: int) -> Iterator[_Part]:
-    """The best part beside a slip for the turn of each group, and for its inverse."""
+    """The part beside a slip with the largest gain, for the turn of each group and for its inverse."""
     graph, ends, segment = mode.problem.graph, mode.problem.ends, witnesses.segment
     chain = graph.paths.chain[graph.nodes[graph.source]]
     end = max(graph.position[graph.source[slip]], graph.position[graph.target[slip]]) - SAME_PLACE
@@ -98,7 +98,7 @@ def _parts(mode: Mode, witnesses: Witnesses, groups: list[_Group], slip: int) ->
     good = np.where(there & ~mode.is_false, witnesses.gain, 0.0)
     is_elsewhere = chain[segment] != chain[slip]
     for group in groups if len(segment) and not is_elsewhere.all() else ():
-        # In the part is the newer end, turned by what the closure is off, or the older one, turned by the inverse.
+        # If the newer end is in the part, the part is turned by the closure's error; if the older one, by its inverse.
         for turn, newer, older in ((group.turn, group.off, group.back), (group.inverse, group.back, group.off)):
             newer_gains, older_gains = (np.where(there & freed, witnesses.gain, 0.0) - good for freed in (newer, older))
             later = _over(witnesses, newer_gains * across, None, witnesses.last)
@@ -112,9 +112,9 @@ def _parts(mode: Mode, witnesses: Witnesses, groups: list[_Group], slip: int) ->
 
 
 def _over(witnesses: Witnesses, change: np.ndarray, begin: np.ndarray | None, end: np.ndarray) -> np.ndarray:
-    """``(S,)`` sums of what closures ``(C,)`` change over segments from ``begin`` to before ``end``.
+    """``(S,)`` sums over segments of the changes ``(C,)`` of closures, each from ``begin`` to before ``end`` ``(C,)``.
 
-    Without ``begin`` over those from ``end`` on.
+    Without ``begin``, each closure counts for the segments from ``end`` on.
     """
     total = np.zeros(len(witnesses.segment) + 1)
     if begin is None:
@@ -126,7 +126,7 @@ def _over(witnesses: Witnesses, change: np.ndarray, begin: np.ndarray | None, en
 
 
 def _split(mode: Mode, part: _Part) -> State:
-    """The part turned, its segment slipped; the slip may be none any more."""
+    """The state with the part turned and its segment slipped; the old slip stays one only if its residual says so."""
     graph, follows = mode.problem.graph, after(mode, part.slip)
     state = turned_by(mode, follows ^ after(mode, part.segment), part.turn)
     trusted = relabelled(mode.problem, state)

@@ -70,14 +70,14 @@ def starts(problem: Problem, prepared: Prepared, cleaned: CleanedClosures, tree:
 
 
 def turned_parts(problem: Problem, prepared: Prepared, tree: Tensor) -> State:
-    """A state with parts turned where odometry seems to slip, many at once."""
+    """A state with parts turned by minimum cuts where odometry seems to have slipped, with labels that then follow."""
     near = noise_between_neighbours(prepared.pairs, problem.components)
     found = _turned_parts(problem, prepared, tree, near)
     return _labelled(problem, at(problem, found, np.ones(0), noise_of(problem, near)))
 
 
 def turned_further(problem: Problem, prepared: Prepared, state: State) -> State:
-    """A state with further parts turned: no single turn takes back what two pairs of slips turned alike."""
+    """A state with further parts turned: two pairs of slips may turn two parts alike, which no single move undoes."""
     noise = NoiseModel(
         problem.components, state.noise.step_variance, state.noise.closure_variance, prepared.noise.outlier_share
     )
@@ -128,10 +128,10 @@ def _prior_levels(priors: SlamPriors) -> list[tuple[float, float]]:
 
 
 def _joined_chains(problem: Problem) -> Tensor | None:
-    """Chains of odometry that closures alone connect, each turned as a whole; corrections ``(K, 4)``.
+    """Corrections ``(K, 4)`` that turn each chain of odometry as a whole, to agree with the closures between chains.
 
-    None with one chain. Of all closures between two the turn is taken that most others agree with; chains are joined
-    along the maximum spanning tree by the number that agree.
+    None if no closure joins two chains. Between two chains the turn is used that most closures agree with, and chains
+    are joined along a tree that prefers pairs with many agreeing closures.
     """
     graph, closure = problem.graph, problem.closure
     _, chain = np.unique(graph.paths.chain[graph.nodes], return_inverse=True)
@@ -139,7 +139,7 @@ def _joined_chains(problem: Problem) -> Tensor | None:
     between = np.flatnonzero(ends[0] != ends[1])
     if len(between) == 0:
         return None
-    # A closure u → v between chains as they were drawn says C_v ≈ e C_u for all of both; from the lower chain on.
+    # A closure u → v between chains says C_v ≈ e C_u for all nodes of both; all are stated from the lower chain on.
     turned = problem.measured[:, closure[between]]
     turned = np.where(ends[0, between] < ends[1, between], turned, quaternion_rows.inverse(turned))
     low, high = np.sort(ends[:, between], axis=0)
@@ -155,7 +155,7 @@ def _joined_chains(problem: Problem) -> Tensor | None:
 
 
 def _robust(problem: Problem, state: State) -> State:
-    """ℓ½ with a robust odometry: iteratively reweighted least squares on all edges alike."""
+    """Iteratively reweighted least squares with an ℓ½-like loss on all edges alike, odometry included."""
     own = variances(problem, state.noise)
     for _ in range(problem.limits.robust_solves):
         residual = residuals(problem, state)

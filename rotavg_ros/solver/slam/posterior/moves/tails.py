@@ -17,10 +17,10 @@ from rotavg_ros.solver.slam.posterior.state import STEP_TAIL_RATIOS, Noise, Stat
 
 
 def propose_tails(mode: Mode) -> Iterator[Proposal]:
-    """Take back all slips that odometry's tails explain, with those tails that explain most.
+    """Proposes to take back all slips that odometry's tails explain, with those tails that explain most.
 
-    Odometry with a few far worse segments looks like many small slips. They are not taken back one by one: without
-    tails each is a slip, and while they are slips no segments are left to be in the tails.
+    Odometry with a few far worse segments looks like many small slips. Taking them back one by one fails: without tails
+    each is a slip, and as long as all of them are slips there is no evidence for tails.
     """
     # Segments that a label rejects stay rejected.
     slips = mode.slipped[np.isfinite(mode.problem.log_odds[mode.slipped])]
@@ -34,9 +34,9 @@ def propose_tails(mode: Mode) -> Iterator[Proposal]:
 
 
 def hides_slips(mode: Mode) -> bool:
-    """Whether a segment is in wide tails that would clearly be a slip if tails were no wider than the least.
+    """Whether some segment in wide tails would clearly be a slip if tails had the smallest ratio of the grid.
 
-    Its error is that of a slip, and the part between two such segments may be turned, with the same evidence as slips.
+    Its error is as large as a slip's, so the part between two such segments may be turned, as between two slips.
     """
     noise, problem, told = mode.state.noise, mode.problem, mode.left_out
     if noise.step_tail_ratio == STEP_TAIL_RATIOS[0] or "slips" in problem.without:
@@ -51,13 +51,13 @@ def hides_slips(mode: Mode) -> bool:
 
 
 class _Mended(NamedTuple):
-    """Without some of S slips.
+    """A labelling with some of S slips explained by tails instead.
 
     Attributes:
-        predicted: by how much F changes, nats, if what others say of each edge stays.
+        predicted: change of F, nats, if all other edges predict each edge as before.
         slips: ``(S,)`` edges.
-        noise: θ with the tails that explain them, and the step's best variance.
-        explained: ``(S,)`` bool, which of the slips.
+        noise: θ with these tails and the best step variance.
+        explained: ``(S,)`` bool, the slips that tails explain.
     """
 
     predicted: float
@@ -67,7 +67,7 @@ class _Mended(NamedTuple):
 
     @classmethod
     def of(cls, mode: Mode, slips: np.ndarray, share: float, ratio: float) -> _Mended:
-        """With tails of a share and ratio."""
+        """With a given share of segments in the tails, and a given ratio of variances."""
         problem, told, before = mode.problem, mode.left_out, mode.state.noise
         noise = replace(before, step_tails=share, step_tail_ratio=ratio)
         # The slips come last.
@@ -93,7 +93,7 @@ class _Mended(NamedTuple):
         )
 
     def state(self, mode: Mode) -> State:
-        """To begin from."""
+        """The state to polish: the explained slips sound, under the new noise."""
         trusted = mode.state.trusted.copy()
         trusted[self.slips[self.explained]] = 1.0
         return replace(with_noise(mode.problem, mode.state, self.noise), trusted=trusted)

@@ -1,8 +1,7 @@
 """A truncated least-squares cost on a closure graph, in which odometry may slip, and its descent from a start.
 
-An edge costs half its squared residual in units of its variance, but no more than it takes to call it wrong: the
-log-odds of being good that an edge without residual has; twice that if it takes two slips. So the cost counts, in nats,
-how much is wrong.
+An edge costs a quarter of its squared residual in units of its variance, but at most the cost of a wrong edge: the
+log-odds of being good of an edge with zero residual, or twice that if one slip does not suffice. Costs are in nats.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.noise.model import NoiseModel
 
-# Estimates on the way to the optimum fit worse than the optimum: their variance counts this many times.
+# Before the optimum is reached residuals are larger than at the optimum: variances are multiplied by this.
 _SLACK = 2.0
 _SETTLING_STEPS = 2
 # Factors of the annealing per step; the larger one is used while the loss is so convex that no edge stands out.
@@ -28,7 +27,7 @@ _ANNEALING_FACTOR, _COARSE_FACTOR = 1.4, 2.0
 _COARSE_CONVEXITY = 100.0
 _DESCENT_STEPS = 8
 _SETTLED_STEP = np.radians(0.03)
-# Odometry does not drift evenly: this share of segments drifts by this much more (in variance) than by length.
+# Odometry does not drift evenly: this share of segments has this many times the variance that its length implies.
 _UNEVEN_SHARE = 0.1
 _UNEVEN_RATIO = 16.0
 # A slip is less than a right angle; a segment that turns by more has slipped twice.
@@ -36,9 +35,9 @@ _MAX_SLIP = np.pi / 2
 _COSINE_OF_MAX_SLIP = np.cos(_MAX_SLIP / 2)
 # Maximum number of steps of a segment that count for a slip: the exact step in a long segment does not matter.
 _MAX_LOCATED_STEPS = 3.0
-# What a real part may be off by.
+# Rounding error of a real part.
 _ROUNDING = 1e-9
-# Weight of edges that are believed wrong: enough to keep a graph solvable that falls apart without them.
+# Least weight, so that a graph that falls apart without its wrong edges remains solvable.
 _MIN_WEIGHT = 1e-9
 
 
@@ -131,9 +130,9 @@ class TruncatedCost:
         return _tensor(rows)
 
     def anneal(self, correction: Tensor) -> Tensor:
-        """The same with a loss annealed from least squares on (graduated non-convexity, Yang et al. 2020).
+        """The same, with a loss that is annealed from least squares (graduated non-convexity, Yang et al. 2020).
 
-        The start ``(K, 4)`` matters only as far as angles are not linear.
+        The start ``(K, 4)`` only affects the linearisation of rotations.
         """
         scale, rows = 2 * self.cap, _rows(correction)
         for _ in range(_SETTLING_STEPS):
@@ -160,12 +159,12 @@ class TruncatedCost:
 
 
 def no_slip_log_odds(steps: np.ndarray, components: int, slip_probability: float) -> np.ndarray:
-    """Log-odds of segments to be good beforehand, a slip being less than a right angle and as likely to be any.
+    """Prior log-odds that segments are sound, relative to a slip that is uniform over turns of less than a right angle.
 
     Args:
-        steps: ``(E,)`` that each passes.
+        steps: ``(E,)`` odometry steps in each.
         components: 1 or 3.
-        slip_probability: of one step.
+        slip_probability: per step.
     """
     narrower = np.log(2.0) if components == 1 else np.log(2 / (1 - np.cos(np.pi / 4)))
     none = np.log1p(-slip_probability) * np.minimum(steps, _MAX_LOCATED_STEPS)

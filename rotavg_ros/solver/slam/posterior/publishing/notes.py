@@ -1,4 +1,4 @@
-"""What is to be known of a labelling, in sentences."""
+"""Warnings for the user about a labelling: large slips, and a sensor mounted otherwise than stated."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _FAR_SLIP = np.radians(10.0)
 
 
 def notes_of(mode: Mode, suspected: np.ndarray | None = None) -> tuple[str, ...]:
-    """Large slips of the odometry, and a sensor whose mounting differs, or may differ, from the stated one.
+    """Warnings about large slips of odometry, and about a sensor mounted, or possibly mounted, otherwise than stated.
 
     Args:
         mode: the labelling.
