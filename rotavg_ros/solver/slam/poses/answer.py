@@ -165,7 +165,7 @@ def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
     if_false = exceedance(turn, predicted, OUTLIER_ANGLE, k)
     rotation = 1 - mode.state.trusted
     rotation[closure] = good * exceeds + (1 - good) * if_false
-    # An outlier has too large an error in rotation or place, whatever its class.
+    # A closure is an outlier if its error in rotation or place is too large, whatever its class.
     turned = np.concatenate((np.broadcast_to(exceeds, (len(places.chance) - 1, len(exceeds))), if_false[None]))
     elsewhere = places.beyond(FALSE_CLOSURE_M) * problem.told.is_known
     score = np.zeros(len(rotation))

@@ -44,7 +44,7 @@ class PoseProblem:
     """A labelling of a robot's graph, with translations (E edges: S segments first; C closures).
 
     Attributes:
-        graph: the view-graph whose odometry was drawn together, N nodes and M edges.
+        graph: the view-graph whose odometry was contracted, N nodes and M edges.
         translation: ``(M, 3)`` position of the target in the source's frame, metres; NaN where unknown, of closures.
         mode: the labelling by rotations alone.
         priors: of translations.

@@ -127,10 +127,10 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     )
     explained = factor.predicted(step)
     left = whitened - explained
-    # xᵀ H x of a step x, whose mean is one for each unknown where x is drawn from N(0, H⁻¹).
+    # xᵀ H x of the step x; for x ~ N(0, H⁻¹) its expectation is the number of unknowns.
     moved_by = math.sqrt(float((explained**2).sum()) / max(step.size, 1))
     scale = _scale(problem, state)
-    # Wherever a closure's source is, and however it is turned.
+    # Variance of a closure's shift if neither the place of its source nor its orientation is known.
     anywhere = scale.extent + (problem.lengths[problem.closures] ** 2).sum(axis=1)
     spend(_ROW * len(jacobian))
     predictions = _left_out(factor, root, left, closure).within(k, ANYHOW, anywhere)

@@ -1,9 +1,9 @@
 """Odometry whose position jumps although its heading does not: spinning wheels, a tracker that relocalises elsewhere.
 
 Such a step is wrong by about the length that it reports, and a segment by its longest step. Closures across the jump
-then seem to join wrong places, all by the same shift of the world. If one jump, or a jump and another that takes it
-back, explains enough of them to outweigh its cost, poses are estimated anew with it; −log p decides, as between any two
-labellings.
+then seem to join wrong places, all by the same shift of the world. If one jump, or a jump and a second one that undoes
+it, explains enough of them to outweigh its cost, poses are estimated again with it, and −log p decides, as between any
+two labellings.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _AGREE = 3.0
 # Minimum number of closures for a jump; a single one is explained equally well by a wrong place.
 _LEAST_WITNESSES = 2
 _WRONG = 0.5
-# Shifts that are examined, at most, those first that single closures support most; number of these for which stretches
-# that lie elsewhere are examined as well; and number of places of either end of a stretch.
+# Maximum number of shifts that are examined, those proposed by the closures of largest gain first; number of these for
+# which displaced stretches are examined as well; and number of bins for the ends of a stretch.
 _LOOKED_AT, _STRETCHES, _ENDS = 48, 4, 1000
-# Positions that differ by less, in steps, are the same.
+# Positions along the path that differ by less than this, in steps, are the same.
 _SAME_PLACE = 1e-9
 # Largest error of a step that jumped, relative to the length that it reports.
 _AS_FAR = 2.0
@@ -38,7 +38,7 @@ _LEAST = 1e-12
 
 
 def log_jump_prior(problem: PoseProblem) -> float:
-    """Log prior of the set of segments that jumped: as rare as slips, and in their longest steps."""
+    """Log prior, nats, of the set of jumps: as rare as slips, each in the longest step of its segment."""
     jumped = np.flatnonzero(problem.jumps)
     any_step = np.log(np.maximum(problem.drawn.own_steps[jumped], 1.0))
     return log_slip_prior(problem.mode.problem, jumped) - float(any_step.sum())
@@ -49,11 +49,11 @@ class Jump:
     """A jump in a graph of S segments and C closures.
 
     Attributes:
-        segment: that jumps.
-        back: another one, before which the jump is taken back; -1 where nothing takes it back.
-        shift: ``(3,)`` metres, by which all between lies elsewhere.
-        gained: nats, by how much closures are likelier than before, one by one, less what the jump costs.
-        freed: ``(C,)`` bool, which come out right.
+        segment: the segment that jumps.
+        back: the segment that undoes the jump; -1 if none does.
+        shift: ``(3,)`` metres by which everything behind the jump, up to ``back``, is displaced.
+        gained: nats by which closures become likelier, each judged independently, minus the cost of the jump.
+        freed: ``(C,)`` bool, closures judged wrong that the jump makes right.
     """
 
     segment: int
@@ -64,12 +64,12 @@ class Jump:
 
 
 def likeliest_jump(pose: PoseMode) -> Jump | None:
-    """The jump that gains most by what each closure says alone; None if none makes several right."""
+    """The jump of largest predicted gain; None if none makes at least two closures right."""
     witnesses = _Witnesses.of(pose)
     speakers: list[int] = []
     left = witnesses.is_wrong.copy()
     while left.sum() >= _LEAST_WITNESSES and len(speakers) < _LOOKED_AT:
-        # Whoever gains most by itself speaks first; all that agree have been heard then.
+        # The closure of largest gain proposes the next shift; those that agree with it need not propose theirs.
         speakers.append(int(np.argmax(np.where(left, witnesses.gain, -1.0))))
         left &= ~witnesses.agreeing(speakers[-1])
     best = _best([witnesses.jump(pose, speaker, witnesses.place(speaker)) for speaker in speakers])
@@ -85,7 +85,10 @@ def _best(jumps: list[Jump]) -> Jump | None:
 
 
 def with_jump(pose: PoseMode, jump: Jump) -> tuple[PoseProblem, PoseStart]:
-    """The problem with one jump more, and where its estimate begins: all between elsewhere, closures as freed."""
+    """The problem with one more jump, and a start with everything behind it displaced and the freed closures believed.
+
+    If the jump is undone, only what lies in between is displaced.
+    """
     problem, state = pose.problem, pose.state
     shifted = _after(problem, jump.segment)
     if jump.back >= 0:
@@ -99,7 +102,7 @@ def with_jump(pose: PoseMode, jump: Jump) -> tuple[PoseProblem, PoseStart]:
 
 
 def without_odd_jumps(pose: PoseMode) -> PoseProblem | None:
-    """The problem without the jumps that closures need not see, or that no step reports; None if there are none."""
+    """The problem without jumps that are too small to matter or longer than any step allows; None if there are none."""
     problem, scale = pose.problem, pose.solved.scale
     jumped = np.flatnonzero(problem.jumps)
     least = problem.priors.least_wrong**2 * problem.shifts * min(scale.closure, scale.extent)
@@ -113,18 +116,18 @@ def without_odd_jumps(pose: PoseMode) -> PoseProblem | None:
 
 
 def jumps_too_far(pose: PoseMode) -> bool:
-    """Whether any jump is one that no step reports."""
+    """Whether any jump is longer than the longest step of its segment allows."""
     return bool(_is_too_far(pose, np.flatnonzero(pose.problem.jumps)).any())
 
 
 def _is_too_far(pose: PoseMode, segments: np.ndarray) -> np.ndarray:
-    """``(n,)`` bool."""
+    """``(n,)`` bool: whether segments jump by more than ``_AS_FAR`` times the length of their longest step."""
     square = (_jumped_by(pose, segments) ** 2).sum(axis=1)
     return np.asarray(square > _AS_FAR**2 * pose.problem.could_jump[segments])
 
 
 def _after(problem: PoseProblem, segment: int) -> np.ndarray:
-    """``(K,)`` bool, all that follows a segment along its chain."""
+    """``(K,)`` bool, the key nodes that follow a segment along its chain."""
     drawn = problem.drawn
     chain = drawn.paths.chain[drawn.nodes]
     end = drawn.position[[drawn.source[segment], drawn.target[segment]]].max()
@@ -132,14 +135,14 @@ def _after(problem: PoseProblem, segment: int) -> np.ndarray:
 
 
 def _jumped_by(pose: PoseMode, segments: np.ndarray) -> np.ndarray:
-    """``(n, 3)`` metres, by which segments are longer than what is between their ends."""
+    """``(n, 3)`` metres: displacement of segments by odometry minus that between the estimated poses of their ends."""
     problem, drawn, position = pose.problem, pose.problem.drawn, pose.state.position
     way = problem.displacements(problem.orientations(pose.state)).displacement[segments]
     return np.asarray(way - (position[drawn.target[segments]] - position[drawn.source[segments]]))
 
 
 def of_jumps(pose: PoseMode) -> tuple[str, ...]:
-    """What is to be known of odometry whose position jumped: a sentence, or none."""
+    """A warning that odometry's position jumped, or none."""
     problem, drawn = pose.problem, pose.problem.drawn
     jumped = np.flatnonzero(problem.jumps)
     if len(jumped) == 0:
@@ -158,17 +161,17 @@ def of_jumps(pose: PoseMode) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Witnesses:
-    """What closures say of jumps (S segments in the order of the path).
+    """Evidence from C closures on jumps of S segments, which are sorted along the path.
 
     Attributes:
-        shift: ``(C, m)`` metres, by which each would have all that follows elsewhere.
-        spread: ``(C,)`` m² per component, to which it knows that.
-        is_wrong: ``(C,)`` bool, which are held to join wrong places.
-        gain: ``(C,)`` nats, what each of these gains by coming out right, and others lose by coming out wrong.
-        first, last: ``(C,)`` segments that each lies across: first ≤ s < last; none where no odometry joins both ends.
-        segment: ``(S,)`` edges.
-        price: ``(S,)`` nats of a jump of each; nothing where it jumps already.
-        variance: ``(S,)`` m² per component, of a jump of each.
+        shift: ``(C, m)`` metres by which everything behind the jump would be displaced, according to each closure.
+        spread: ``(C,)`` m² per component, variance of that shift.
+        is_wrong: ``(C,)`` bool, closures that are judged to join wrong places.
+        gain: ``(C,)`` nats that a wrong closure gains by becoming right, or that a right one loses by becoming wrong.
+        first, last: ``(C,)`` segments that each closure spans: first ≤ s < last; none if no odometry joins its ends.
+        segment: ``(S,)`` edges of the closure graph.
+        price: ``(S,)`` nats, cost of a jump in each; 0 if it jumps already.
+        variance: ``(S,)`` m² per component, prior variance of a jump in each.
     """
 
     shift: np.ndarray
@@ -192,9 +195,10 @@ class _Witnesses:
         places = solved.places
         can_tell = told.is_known & (_chain(problem, drawn.source) == _chain(problem, drawn.target))[mode.closure]
         is_wrong = (places.right < _WRONG) & can_tell & (told.label == 0)
-        # Off by nothing it would be as likely as the first, or more; without its right place it is less by the second.
+        # A jump that removes a wrong closure's offset gives it at least the density log_here; a right closure that is
+        # displaced loses its right place.
         judge = Judge(told, k, problem.priors)
-        # Closures that agree tell each other of their wrong places: together they are as likely as one after the other.
+        # In order of detection, since closures that agree would otherwise support each other's wrong places.
         held = judge(solved.predictions, solved.maps, places.chance, solved.scale, in_order=True).log_density
         freed, lost = log_here - held, -np.log(np.maximum(1 - places.right, _LEAST))
         gain = np.where(can_tell, np.maximum(np.where(is_wrong, freed, lost), 0.0), 0.0)
@@ -212,12 +216,12 @@ class _Witnesses:
         return cls(shift, spread + own, is_wrong, gain, first, last, order, np.where(jumps, 0.0, price), variance)
 
     def agreeing(self, speaker: int, sign: float = 1.0) -> np.ndarray:
-        """``(C,)`` bool, wrong closures that the jump which one speaks of makes right; or the opposite one."""
+        """``(C,)`` bool, wrong closures with the same shift as the proposing one; with ``sign`` -1, the opposite."""
         square = ((sign * self.shift - self.shift[speaker]) ** 2).sum(axis=1) / self.shift.shape[1]
         return np.asarray(self.is_wrong & (square < _AGREE**2 * (self.spread + self.spread[speaker])))
 
     def place(self, speaker: int) -> tuple[int, int, float]:
-        """Where a jump gains most that makes right what one closure and all that agree say; and what it gains."""
+        """Index of the segment where the jump that one closure proposes gains most; -1: not undone; gain in nats."""
         rest()
         change = self._changed(speaker)
         across = np.zeros(len(self.segment) + 1)
@@ -228,16 +232,16 @@ class _Witnesses:
         return best, -1, float(gained[best])
 
     def stretch(self, speaker: int) -> tuple[int, int, float]:
-        """The stretch that gains most if all in it lies elsewhere: where it begins and ends, and what it gains.
+        """The displaced stretch that gains most: indices of its first and last segment (-1: none), and gain in nats.
 
-        Closures into it say one shift, and those out of it the opposite one. With A and B sums over closures by where
-        both ends are, all begins and ends are looked at at once.
+        Closures into the stretch have the proposed shift, closures out of it the opposite one. Two-dimensional prefix
+        sums over the closures' ends give the gain of all begins and ends at once.
         """
         rest()
         count = len(self.segment)
         bins = np.minimum(np.arange(count + 1) * _ENDS // max(count, _ENDS), _ENDS)
         older, newer = bins[self.first], bins[self.last]
-        # The likeliest segment of each bin stands for it.
+        # Each bin is represented by its cheapest segment.
         price_of = self._price_of(speaker)
         segment = np.lexsort((price_of, bins[:-1]))
         segment = segment[np.unique(bins[:-1][segment], return_index=True)[1]]
@@ -258,24 +262,24 @@ class _Witnesses:
         return int(segment[begin]), back, float(gained[begin, end])
 
     def _price_of(self, speaker: int) -> np.ndarray:
-        """``(S,)`` nats of a jump by the shift that one closure speaks of.
+        """``(S,)`` nats, cost of a jump by the shift that one closure proposes.
 
-        The first that speaks tells how far it is, and gains nothing.
+        That closure determines the shift, so the cost includes the ratio of the shift's prior to its posterior width.
         """
         square, known = float((self.shift[speaker] ** 2).sum()), float(self.spread[speaker])
         width = self.shift.shape[1] * np.log1p(self.variance / known) / 2
         off = square / (2 * np.maximum(self.variance, np.finfo(np.float64).tiny))
-        # As far as that is known.
+        # Shortest shift that is compatible with its uncertainty.
         least = max(np.sqrt(square) - _AGREE * np.sqrt(self.shift.shape[1] * known), 0.0)
         off[least**2 > _AS_FAR**2 * self.variance] = np.inf
         return np.asarray(np.where(self.price > 0, self.price + off + width, 0.0))
 
     def _changed(self, speaker: int, sign: float = 1.0) -> np.ndarray:
-        """``(C,)`` nats, what closures gain by the jump that one speaks of, those that lie across it."""
+        """``(C,)`` nats: gain of each closure (negative: loss) if it spans the jump that one closure proposes."""
         return np.asarray(np.where(self.agreeing(speaker, sign), self.gain, np.where(self.is_wrong, 0.0, -self.gain)))
 
     def jump(self, pose: PoseMode, speaker: int, place: tuple[int, int, float]) -> Jump:
-        """The jump that one closure implies, at the place where it gains most."""
+        """The jump that one closure proposes, at the given place: begin, end and gain."""
         begin, end, gained = place
         newer, older = self._inside(self.last, begin, end), self._inside(self.first, begin, end)
         into, out = newer & ~older & self.agreeing(speaker), older & ~newer & self.agreeing(speaker, -1.0)
@@ -283,7 +287,7 @@ class _Witnesses:
         weight = (into.astype(np.float64) - out) / self.spread
         shift = (weight @ self.shift) / max(float(np.abs(weight).sum()), np.finfo(np.float64).tiny)
         back = -1 if end < 0 else int(self.segment[end])
-        # If these are right after all, wrong ones are less common among all others as well.
+        # If these closures are right, wrong places are also less common among all others.
         told, priors, chance = pose.problem.told, pose.problem.priors, pose.solved.places.chance
         gained += log_places(_right(chance, freed), told, priors) - log_places(chance, told, priors)
         return Jump(int(self.segment[begin]), back, pose.problem.bases[1] @ shift, gained, freed)
@@ -294,7 +298,7 @@ class _Witnesses:
 
 
 def _right(chance: np.ndarray, closures: np.ndarray) -> np.ndarray:
-    """``(J + 1, C)`` chances with some closures at right places."""
+    """``(J + 1, C)`` class probabilities with some closures certainly at right places."""
     changed = np.where(closures, 0.0, chance)
     changed[0] += closures
     return changed

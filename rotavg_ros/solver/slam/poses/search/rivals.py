@@ -1,4 +1,4 @@
-"""Rival labellings by rotations and translations together: which are started from, and which remain."""
+"""Compares rival labellings by rotations and translations together: which are estimated, and which are left."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class Rivals:
 
     Attributes:
         modes: labellings.
-        poses: poses of each, with rotations judged by places, too.
-        share: probabilities.
+        poses: poses of each labelling; here rotations are judged by places, too.
+        share: probability of each.
     """
 
     modes: list[Mode]
@@ -59,7 +59,7 @@ def rival_poses(
         begun.append(_begun(PoseProblem(graph, translation, mode), begun))
     for pose in begun:
         ended.append(settling(pose, min((rival.cost for rival in ended), default=np.inf)))
-    # Odometry's error is a property of the robot and does not depend on the labels.
+    # Only once, for the likeliest labelling: odometry's error is a property of the robot, not of the labels.
     least = min(rival.cost for rival in ended)
     likeliest = next(pose for pose, rival in zip(begun, ended, strict=True) if rival.cost == least)
     if (other := _begun_otherwise(likeliest)) is not None:
@@ -77,9 +77,9 @@ def rival_poses(
 
 
 def _begun(problem: PoseProblem, others: Sequence[PoseMode]) -> PoseMode:
-    """Poses of a labelling, from nothing, or from those of another one that holds nearly the same closures.
+    """Poses of a labelling: estimated from scratch, or beginning at those of a labelling with nearly the same labels.
 
-    Not where odometry slipped elsewhere: all between the two slips lies elsewhere, and so do its closures' places.
+    Not if different segments slipped: everything between the two slips is displaced, and its closures' places change.
     """
     mode = problem.mode
     slips_alike = (pose for pose in others if np.array_equal(mode.slipped, pose.problem.mode.slipped))
@@ -89,7 +89,7 @@ def _begun(problem: PoseProblem, others: Sequence[PoseMode]) -> PoseMode:
 
 
 def _distinct(ended: Sequence[Rival], farthest: float) -> list[Rival]:
-    """The likeliest of each labelling, but for those that are less likely than the first by more than some nats."""
+    """Distinct labellings, likeliest first, without those less likely than the first by more than ``farthest`` nats."""
     rivals: list[Rival] = []
     for rival in sorted(ended, key=lambda rival: rival.cost):
         is_far = rivals and rival.cost > rivals[0].cost + farthest
@@ -99,9 +99,9 @@ def _distinct(ended: Sequence[Rival], farthest: float) -> list[Rival]:
 
 
 def _with_other_runs(rivals: Sequence[Rival]) -> list[Rival]:
-    """Whole runs believed and doubted where that is likelier.
+    """The rivals that believing or doubting whole runs makes likelier.
 
-    Where none is, it is not asked of another labelling that holds nearly the same closures.
+    A rival is skipped if this changed nothing in another one with nearly the same labels.
     """
     found: list[Rival] = []
     unmoved: list[Rival] = []
@@ -114,13 +114,13 @@ def _with_other_runs(rivals: Sequence[Rival]) -> list[Rival]:
 
 
 def _jumping(rival: Rival) -> list[Rival]:
-    """The same labelling with odometry's position jumping, as long as that is likelier, or would be a rival."""
+    """The same labelling with jumps of odometry's position, those that make it likelier or could be rivals."""
     before = rival.pose.problem
     if "jumps" in before.mode.problem.without:
         return []
     begun = [rival]
-    # With a jump what is right may be given up, or odometry seems to err by more everywhere until nothing seems wrong:
-    # they are looked for before closures pull, and before variances grow.
+    # Closures that pull across a jump bend the map until right ones seem wrong, or odometry's variance grows until
+    # nothing does. So jumps are also looked for before closures pull, and before variances grow.
     has_grown = rival.pose.state.noise.way > before.turn_noise.way
     for solves in (1, HELD) if has_grown else (1,):
         jumped = _with_jumps(estimate_poses(before, ending=Ending(held_for=solves)))
@@ -146,7 +146,7 @@ def _jumping_further(rival: Rival) -> list[Rival]:
 
 
 def _with_jumps(pose: PoseMode) -> PoseMode:
-    """Poses with all jumps that gain, most variances as they began."""
+    """Poses with all jumps that are predicted to gain, most variances held at their initial values."""
     for _ in range(_MAX_JUMPS):
         jump = likeliest_jump(pose)
         if jump is None or jump.gained < 0:
@@ -157,10 +157,10 @@ def _with_jumps(pose: PoseMode) -> PoseMode:
 
 
 def _first(modes: Sequence[Mode]) -> list[Mode]:
-    """Those to begin with, of which none turns everything as another one does.
+    """The labellings to estimate poses for; of several that turn the map alike, only the likeliest.
 
-    Odometry that slipped by rotations alone may have had to jump, so places are asked of labellings without slips,
-    however unlikely rotations alone make these: they are counted from the likeliest of their own.
+    A slip of rotations may imply an impossible jump of position. So the likeliest labellings without slips are kept,
+    however unlikely they are by rotations alone: their distance counts from the likeliest without slips.
     """
     unslipped = min((mode.cost for mode in modes if len(mode.slipped) == 0), default=np.inf)
     first: list[Mode] = []
@@ -174,7 +174,7 @@ def _first(modes: Sequence[Mode]) -> list[Mode]:
 
 
 def _begun_otherwise(usual: PoseMode) -> PoseMode | None:
-    """Poses of the same labelling, begun with the noise that odometry tells of in the place of what is believed."""
+    """Poses of the same labelling from other initial variances, which odometry suggests; None if places end alike."""
     level = likeliest_level(usual)
     if level == USUAL:
         return None

@@ -1,13 +1,13 @@
-"""Believe or doubt a whole run: closures that support each other's wrong class, although jointly it is less likely.
+"""Believes or doubts whole runs: their closures support each other's class, although jointly another one is likelier.
 
 Each closure of a rejected run is judged wrong because its neighbours are. If all K closures of a run are right and none
-of them pulls, all else predicts their discrepancies y as N(0, S), S = A H⁻¹ Aᵀ + V, with A their rows and V their own
-variances. Where this is likelier than their current classes, poses are estimated anew with the run believed; −log p
-decides, as between any two labellings.
+of them pulls, the other rows predict their discrepancies y as N(0, S), S = A H⁻¹ Aᵀ + V, with A their rows and V their
+own variances. If this is likelier than their current classes, poses are estimated again with the run believed, and
+−log p decides, as between any two labellings.
 
-Conversely, closures that join the same wrong places may bend the map until they fit, and each is judged right because
-the others are. A run's common error is an unknown of its own: where all else predicts it to be far from zero, the run
-is held to join wrong places, and poses are estimated anew.
+Conversely, closures that join the same wrong places may bend the map until they fit; each is then judged right because
+the others are. A run's common error is an unknown of its own. If the other rows predict it to be far from zero, the run
+is held to join wrong places, and poses are estimated again.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ from rotavg_ros.solver.slam.poses.repeats.neighbours import log_all_right
 from rotavg_ros.solver.slam.poses.search.settling import LEAST_GAIN, SLACK, Rival, moved
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 
-# Number of runs that are examined, those first that are off by the fewest standard deviations; their least number of
-# closures; and most closures of a run, whose result decides about the others.
+# Maximum number of rejected runs that are examined, those with the smallest mean offset first; minimum number of
+# closures in a run; and maximum number of its closures that are examined. The rest of a longer run follows in the
+# estimate that begins with these believed.
 _LOOKED_AT, _LEAST_MEMBERS, _MOST_MEMBERS = 32, 2, 96
 _WRONG = 0.5
-# Runs are doubted that would be as far off by chance with less than this probability.
+# A run is doubted if a common error this large has less than this probability.
 _UNLIKELY = 0.05
-# Most runs that are believed, or doubted, one after the other; and number of runs that are tried each time for doubt.
+# Maximum number of rounds of believing, or of doubting; and number of runs that each round of doubting tries.
 _MAX_RUNS, _MAX_DOUBTED = 8, 4
 
 
 def with_runs(rival: Rival) -> Rival:
-    """The same labelling with whole runs believed, as long as that is likelier."""
+    """The same labelling with whole runs believed, one after the other, as long as −log p falls."""
     if "believed-runs" in rival.mode.problem.without:
         return rival
     tried: set[bytes] = set()
@@ -55,7 +56,7 @@ def with_runs(rival: Rival) -> Rival:
 
 
 def without_runs(rival: Rival) -> Rival:
-    """The same labelling with whole runs doubted, as long as that is likelier."""
+    """The same labelling with whole runs doubted, one after the other, as long as −log p falls."""
     if "doubted-runs" in rival.mode.problem.without:
         return rival
     for _ in range(_MAX_RUNS):
@@ -70,7 +71,7 @@ def without_runs(rival: Rival) -> Rival:
 
 
 def runs_to_believe(pose: PoseMode) -> list[tuple[float, np.ndarray]]:
-    """By how many nats runs are likelier to be right than what they are held for, and their closures, best first."""
+    """Rejected runs that may be right: gain in nats over their current classes, and closures; largest gain first."""
     told, places = pose.problem.told, pose.solved.places
     could = told.is_known & (told.label == 0) & (places.right < _WRONG)
     runs = _nearest(pose, could)
@@ -83,7 +84,7 @@ def runs_to_believe(pose: PoseMode) -> list[tuple[float, np.ndarray]]:
 
 
 def runs_to_doubt(pose: PoseMode) -> list[np.ndarray]:
-    """Closures of runs that are believed though all else says that they are off alike, the most unlikely first."""
+    """Closures of believed runs whose common error is improbably large, the most improbable run first."""
     problem = pose.problem
     of_run, run = problem.run[problem.mode.problem.closure], problem.told.run
     could_be_wrong = problem.told.is_known & (problem.told.label == 0)
@@ -97,9 +98,10 @@ def runs_to_doubt(pose: PoseMode) -> list[np.ndarray]:
 
 
 def unlikely_offsets(pose: PoseMode) -> np.ndarray:
-    """``(R,)`` squares, in standard deviations, of what each run's closures err alike by all that others say of it.
+    """``(R,)`` squared Mahalanobis distance of each run's common error from zero, as all other rows predict it.
 
-    What a run has in common is a row of the system by itself: all other rows say N(μ, P) of it, which is whitened.
+    The prior of a run's common error is a row of the system. All other rows predict that row's residual as N(μ, P), in
+    units of its prior standard deviation.
     """
     problem, solved = pose.problem, pose.solved
     row = len(problem.drawn.source) + np.arange(problem.num_runs)
@@ -109,7 +111,7 @@ def unlikely_offsets(pose: PoseMode) -> np.ndarray:
 
 
 def _nearest(pose: PoseMode, could: np.ndarray) -> list[np.ndarray]:
-    """Members of runs that could be right, those first that are off by the fewest standard deviations in common."""
+    """Closures of each rejected run, the run whose mean discrepancy is the fewest standard deviations first."""
     told, predictions, k = pose.problem.told, pose.solved.predictions, pose.problem.turns
     count = np.bincount(told.run, could)
     off = np.stack([np.bincount(told.run, could * told.sign * column) for column in predictions.mean.T], axis=1)
@@ -117,7 +119,7 @@ def _nearest(pose: PoseMode, could: np.ndarray) -> list[np.ndarray]:
     own = np.stack((told.rotation_variance, pose.solved.scale.good), axis=1)
     total = spread + np.repeat(own, [k, spread.shape[1] - k], axis=1)
     variance = np.stack([np.bincount(told.run, could * column) for column in total.T], axis=1)
-    # Means of all members, of which each knows about the same.
+    # The members' predictions are nearly the same, so their errors count as fully correlated.
     variance *= np.maximum(count, 1.0)[:, None]
     square = (off**2 / np.maximum(variance, np.finfo(np.float64).tiny)).sum(axis=1)
     order = np.argsort(np.where(count >= _LEAST_MEMBERS, square, np.inf), kind="stable")[:_LOOKED_AT]
@@ -127,11 +129,11 @@ def _nearest(pose: PoseMode, could: np.ndarray) -> list[np.ndarray]:
 
 @dataclass(frozen=True)
 class _Run:
-    """K closures that are likelier to be right together, each given the others, than what they are held for.
+    """K closures of a run, each of which is likelier to be right, given the others, than its current class.
 
     Attributes:
         members: ``(K,)`` closures.
-        gained: nats, by all of them.
+        gained: nats, by which all of them together are likelier if they are right.
     """
 
     members: np.ndarray
@@ -139,12 +141,12 @@ class _Run:
 
     @classmethod
     def of(cls, pose: PoseMode, members: np.ndarray, held: np.ndarray) -> _Run | None:
-        """The largest such part of a run, which whoever gains least by being right leaves first; None if there is none.
+        """The part of a run that is left after removing, one by one, the closure that gains least; None if none is.
 
         Args:
-            pose: that none of them pulls.
+            pose: poses in which none of them pulls.
             members: ``(n,)`` closures.
-            held: ``(n,)`` nats, of each as it is held to be.
+            held: ``(n,)`` nats, log density of each under its current classes.
         """
         stop_if_abandoned()
         rest()
@@ -155,7 +157,7 @@ class _Run:
             pulled = (precision @ off).reshape(-1, d)
             each = np.arange(len(members))
             own = precision.reshape(len(members), d, len(members), d)[each, :, each]
-            # N(y_i given the others) of N(0, P⁻¹): P y and P's own blocks tell it.
+            # The conditional density of y_i given the others, for y ~ N(0, P⁻¹), needs only P y and P's blocks.
             square = (pulled * np.linalg.solve(own, pulled[:, :, None])[:, :, 0]).sum(axis=1)
             given_others = (np.linalg.slogdet(own)[1] - square - d * np.log(2 * np.pi)) / 2
             least = int(np.argmin(given_others - held))
@@ -164,7 +166,7 @@ class _Run:
                 problem, places = pose.problem, pose.solved.places
                 log_right = log_all_right(places.chance, problem.told, problem.priors, len(members))
                 return cls(members, float(log_density / 2 - held.sum()) + log_right)
-            # The inverse of what is left of the covariance, by that of all.
+            # Inverse of the remaining covariance, by a Schur complement of the whole inverse.
             stays = np.repeat(each != least, d)
             across = precision[np.ix_(stays, ~stays)]
             precision = precision[np.ix_(stays, stays)] - across @ np.linalg.solve(own[least], across.T)
@@ -174,7 +176,7 @@ class _Run:
 
 
 def _discrepancies(pose: PoseMode, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``(K d, K d)`` covariance of a run's discrepancies if its closures are right, and these ``(K d,)``."""
+    """Covariance ``(K d, K d)`` of the discrepancies of K closures if they are right, and these ``(K d,)``."""
     problem, solved, k = pose.problem, pose.solved, pose.problem.turns
     rows, d = problem.mode.problem.closure[members], problem.turns + problem.shifts
     own = np.repeat(problem.closure_turns(pose.state.noise)[members, None], d, axis=1)

@@ -77,12 +77,12 @@ def settling(pose: PoseMode, least: float = np.inf) -> Rival:
 
 
 def settled(problem: PoseProblem, start: PoseStart) -> Rival:
-    """Result of a start."""
+    """The rival that a start of a problem leads to."""
     return settling(estimate_poses(problem, start=start))
 
 
 def moved(rival: Rival, start: PoseStart) -> Rival:
-    """Result of another start of the same labelling; the rival itself if places end as they were."""
+    """The rival that another start of the same labelling leads to; ``rival`` itself if places end as they were."""
     ending = Ending(until=rival.pose.solved.places)
     pose = estimate_poses(rival.pose.problem, start=start, ending=ending)
     is_same = pose.solved.places.is_like(rival.pose.solved.places)
@@ -90,12 +90,12 @@ def moved(rival: Rival, start: PoseStart) -> Rival:
 
 
 def _held(problem: PoseProblem, pose: PoseMode) -> Rival:
-    """A labelling as it is, from other poses."""
+    """The rival of ``problem``'s labelling, with labels held; its estimate begins at ``pose``."""
     return Rival(problem.mode, estimate_poses(problem, hold=True, start=PoseStart.at(pose)))
 
 
 def relabelled(pose: PoseMode) -> Mode:
-    """The labelling by which closures' rotations are right where places and rotations together say so."""
+    """The labelling in which closures are good where places and rotations together favour it."""
     before = pose.problem.mode
     problem = before.problem
     closure = problem.closure
