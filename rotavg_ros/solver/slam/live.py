@@ -81,10 +81,10 @@ def update_slam(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | No
 
 
 def resume_slam(graph: ViewGraph, labels: KeptLabels, run: Run) -> Estimate | None:
-    """The answer of a graph from the labels of the last solve alone; None if they do not fit the graph.
+    """The answer of a graph, from only the labels of an earlier solve; None if they do not fit the graph.
 
-    There is no earlier answer to fall back on, so it is not suspended. Where closures have joined separate parts, the
-    start says how; which of them are good is decided by a whole search alongside the next answers.
+    There is no earlier answer to fall back on, so this solve is not suspended. If closures have joined separate parts,
+    ``run.warm_start`` says how, and a whole search, alongside the next answers, decides which of them are good.
     """
     if run.warm_start is None or labels.by_places is not has_places(graph) or first_of_each(graph) is not None:
         return None
@@ -105,20 +105,20 @@ def resume_slam(graph: ViewGraph, labels: KeptLabels, run: Run) -> Estimate | No
 
 
 def _joints(graph: ViewGraph, is_known: np.ndarray) -> np.ndarray:
-    """``(n,)`` closures that join what edges that are known ``(M,)``, and odometry, leave apart."""
+    """``(n,)`` closures that join parts which known edges, ``(M,)`` bool, and odometry leave separate."""
     apart = graph.select_edges(torch.from_numpy(is_known) | graph.is_odometry).components()
     return torch.nonzero(apart[graph.source] != apart[graph.target])[:, 0].numpy()
 
 
 def _far_from(graph: ViewGraph, edges: np.ndarray, start: torch.Tensor) -> np.ndarray:
-    """Those of some edges ``(n,)`` that contradict orientations ``(N, 4)``."""
+    """Those of some edges ``(n,)`` that contradict orientations ``(N, 4)`` by more than ``_FAR``."""
     chosen = graph.select_edges(torch.from_numpy(edges))
     off = edge_residual(start, chosen.target_from_source, chosen.source, chosen.target)
     return np.asarray(edges[(rotations.angle(off) > _FAR).numpy()])
 
 
 def advance(memory: SlamMemory, work: float) -> None:
-    """Continue what a tick has left undone, for ``work`` units; the next tick finds it done."""
+    """Continues the suspended solves of ``memory`` for ``work`` units; the next tick uses the result."""
     update, ahead = memory.update, memory.ahead
     with metered() as meter:
         if update is not None and not update.has_failed:
@@ -140,7 +140,7 @@ def _searched_ahead(graph: ViewGraph, known: SlamMemory, run: Run) -> SlamMemory
 
 
 def _going_on_from(found: SlamMemory, graph: ViewGraph, known: SlamMemory, run: Run) -> SlamMemory:
-    """What is known after a whole search: what came meanwhile counts as it did until it is solved from there."""
+    """The memory after a whole search; closures that came meanwhile count as before until an update includes them."""
     found = replace(found, update_work=known.update_work)
     if _num_new_closures(graph, found) == 0:
         return found
@@ -159,9 +159,9 @@ def _by_itself(run: Run) -> Run:
 
 
 def _caught_up(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | None:
-    """What is known once closures that are new are solved, as far as the work goes; None if that leads nowhere.
+    """The memory after an update with the new closures, as far as the work allows; None if none can be made.
 
-    Where it would not go to the end, it is not begun with: the answer comes first.
+    An update that is not expected to end within the work is not begun before the answer; it runs afterwards.
     """
     known, ration = memory, math.inf if run.work is None else run.work
     with metered() as meter:
@@ -176,7 +176,7 @@ def _caught_up(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | N
             if update is None or has_none:
                 before = replace(known, ahead=None, update=None, columns=None)
                 update = Resumable(partial(_updated, graph, before, _by_itself(run)))
-            # What hangs otherwise cannot be laid on meanwhile.
+            # Nodes that are not attached by odometry cannot be placed until the update has ended.
             left = ration - meter.spent if hangs_on else math.inf
             if not update.has_ended and (known.update_work > left or not update.go_on(left)):
                 return replace(known, update=update)
@@ -191,9 +191,9 @@ def _caught_up(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | N
 
 
 def _thinned_out(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | None:
-    """What is known once a graph that has lost keyframes is solved with the labels that are left; None if it cannot.
+    """The memory for a graph that has lost keyframes, solved with the remaining labels; None if that is impossible.
 
-    There is nothing to answer by meanwhile, so it goes to the end.
+    There is no answer to fall back on, so this solve is not suspended.
     """
     before = memory.thinned_to(graph)
     if before is None or run.warm_start is None or (memory.poses is None) is has_places(graph):
@@ -211,13 +211,13 @@ def _networks(run: Run) -> tuple[SlamCleanNet, SlamFineNet]:
 
 
 def _growth(graph: ViewGraph, known: SlamMemory, since: ViewGraph | Linear) -> Growth | None:
-    """How nodes that are new since then hang on those before by odometry; None where they do not."""
+    """How nodes newer than ``since`` are attached to older ones by odometry; None if they are not."""
     new = np.arange(since.num_edges, graph.num_edges)
     return Growth.of(known.calibrated(graph), new[graph.is_odometry[new].numpy()], since.num_nodes)
 
 
 def _updated(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | None:
-    """What is known once the graph is solved from the labelling before, closures that are new judged by it."""
+    """The memory after a solve from the previous labelling, with new closures judged; None if it cannot be made."""
     assert run.warm_start is not None
     before = memory.poses
     calibrated = memory.calibrated(graph)
@@ -236,7 +236,7 @@ def _updated(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | Non
 
 
 def _laid_on(graph: ViewGraph, known: SlamMemory, ration: float) -> Estimate | None:
-    """The known answer, with odometry and closures since then added to it."""
+    """The known answer with new odometry appended and new closures included by linearisation; None if impossible."""
     edges = np.arange(graph.num_edges)
     waits = (edges >= known.graph.num_edges) & ~graph.is_odometry.numpy()
     kept, closure = np.flatnonzero(~waits), np.flatnonzero(waits)
@@ -271,12 +271,12 @@ def _laid_on(graph: ViewGraph, known: SlamMemory, ration: float) -> Estimate | N
 
 
 def _linear(known: SlamMemory) -> Linear:
-    """The normal approximation at the last solve."""
+    """The linearisation about the last solve."""
     return Linear.of_rotations(known.mode) if known.poses is None else Linear.of_poses(known.poses.pose)
 
 
 def _most_columns(linear: Linear, ration: float) -> int:
-    """Number of closures whose columns a tick may compute."""
+    """Maximum number of new closures whose columns a tick may compute."""
     return int(min(max(1.0, _COLUMNS * ration / (linear.column_work * linear.size)), _MOST))
 
 
@@ -285,7 +285,7 @@ def _num_new_closures(graph: ViewGraph, known: SlamMemory) -> int:
 
 
 def _with_columns(graph: ViewGraph, known: SlamMemory) -> SlamMemory | None:
-    """What is known, with the columns of closures that have come since: no closure counts less once it counts."""
+    """The memory with the columns of all new closures, so that none loses its influence when an update replaces it."""
     estimate = _laid_on(graph, known, math.inf)
     return None if estimate is None else cast(SlamMemory, estimate.memory)
 
@@ -293,13 +293,13 @@ def _with_columns(graph: ViewGraph, known: SlamMemory) -> SlamMemory | None:
 def _with_closures(
     estimate: Estimate, told: Conditioned, linear: Linear, edges: tuple[np.ndarray, np.ndarray]
 ) -> Estimate:
-    """The estimate with closures that it does not know.
+    """The estimate with further closures.
 
     Args:
-        estimate: of m edges.
-        told: of n closures.
-        linear: that they were told by.
-        edges: ``(m,)`` and ``(n,)`` their numbers in the whole graph.
+        estimate: estimate on m edges.
+        told: result for the n further closures.
+        linear: the linearisation behind it.
+        edges: ``(m,)`` and ``(n,)`` numbers of both in the whole graph.
     """
     kept, closure = (torch.from_numpy(each) for each in edges)
     laid = told.laid

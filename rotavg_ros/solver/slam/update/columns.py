@@ -1,9 +1,9 @@
-"""What new closures would move: columns H⁻¹ Aᵀ, which stay as they are until the next solve.
+"""The columns H⁻¹ Aᵀ of new closures, which stay valid until the next solve.
 
-With H = L Lᵀ (:mod:`~rotavg_ros.solver.algebra.sparse.multifrontal`) only half of each is worked out, L⁻¹ Aᵀ, which has
-numbers in what is eliminated after a closure's ends and nowhere else. Halves tell what closures have in common,
-and what all of them together move takes one more solve, however many they are. By rotations alone both halves are
-worked out at once.
+With H = L Lᵀ (:mod:`~rotavg_ros.solver.algebra.sparse.multifrontal`) only half of each is computed, L⁻¹ Aᵀ, which is
+non-zero only in unknowns that are eliminated after a closure's ends. Products of halves give the covariances between
+closures, and one more solve gives the step that all closures cause together. By rotations alone H⁻¹ Aᵀ is computed at
+once.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from rotavg_ros.solver.slam.update.linear import Linear
 
 @dataclass(frozen=True)
 class _Rows:
-    """Some rows of ``(K + R) d``, the others nothing.
+    """The non-zero rows of a matrix with ``(K + R) d`` rows and m columns.
 
     Attributes:
-        index: ``(s,)`` which.
-        value: ``(s, m)``.
+        index: ``(s,)`` numbers of these rows.
+        value: ``(s, m)`` the rows.
     """
 
     index: np.ndarray
@@ -31,26 +31,27 @@ class _Rows:
 
     @classmethod
     def of(cls, columns: np.ndarray) -> _Rows:
-        """Of ``((K + R) d, m)``."""
+        """The non-zero rows of ``((K + R) d, m)``."""
         index = np.flatnonzero(columns.any(axis=1))
         return cls(index, columns[index])
 
     def with_each(self, columns: np.ndarray) -> np.ndarray:
-        """``(m, n)`` products with ``((K + R) d, n)``."""
+        """``(m, n)`` products of all columns with those of ``((K + R) d, n)``."""
         return product(self.value.T, columns[self.index])
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns of n new closures, d rows each.
+    """Columns of n new closures, d each.
 
     Attributes:
         edge: ``(n,)`` edges of the view-graph.
-        left, half: as they came; the product of one's left with the other's half is what two have in common.
+        left, half: parts of the closures, in the order in which they were added; ``left`` of one closure times ``half``
+            of another is their covariance (:attr:`Linear.left`, :attr:`Linear.half`).
         covariance: ``(n d, n d)`` A H⁻¹ Aᵀ.
-        anchors: ``(b,)`` blocks, ascending, that new nodes hang on.
-        units: ``((K + R) d, b d)`` what is left of columns that are one in these.
-        at_anchors: ``(n d, b d)`` what closures have in common with them.
+        anchors: ``(b,)`` blocks that the anchors of new nodes belong to, ascending.
+        units: ``((K + R) d, b d)`` :attr:`Linear.left` of the unit columns of these blocks.
+        at_anchors: ``(n d, b d)`` covariance of closures and these blocks.
     """
 
     edge: np.ndarray
@@ -68,12 +69,12 @@ class Columns:
         return cls(nothing, (), (), np.empty((0, 0)), nothing, np.empty((0, 0)), np.empty((0, 0)))
 
     def and_of(self, linear: Linear, edge: np.ndarray, right: np.ndarray) -> Columns:
-        """With more closures.
+        """The columns of these closures and of more.
 
         Args:
-            linear: that all columns are of.
-            edge: ``(m,)``.
-            right: ``(K + R, d, m d)`` Aᵀ.
+            linear: the last solve, which all columns refer to.
+            edge: ``(m,)`` the further closures.
+            right: ``(K + R, d, m d)`` their Aᵀ.
         """
         left = linear.left(right)
         half = linear.half(left)
@@ -95,7 +96,7 @@ class Columns:
         )
 
     def with_anchors(self, linear: Linear, blocks: np.ndarray) -> Columns:
-        """That know of some blocks, the same ones rather than many, what closures have in common with them."""
+        """The columns, with the covariances of closures and some blocks; few distinct blocks are expected."""
         if np.isin(blocks, self.anchors).all():
             return self
         d, anchors = linear.size, np.unique(blocks)
@@ -105,7 +106,7 @@ class Columns:
         return replace(self, anchors=anchors, units=units, at_anchors=self._with_all(self.half, units))
 
     def moves(self, linear: Linear, pull: np.ndarray) -> np.ndarray:
-        """``(K + R, d, q)`` what moves where so much pulls at each row, ``(n d, q)``."""
+        """``(K + R, d, q)`` step H⁻¹ Aᵀ x for x ``(n d, q)``."""
         total = np.zeros((linear.num_blocks * linear.size, pull.shape[1]))
         first = 0
         for half in self.half:
@@ -115,19 +116,19 @@ class Columns:
         return linear.ended(total)
 
     def at(self, blocks: np.ndarray) -> np.ndarray:
-        """``(…, d, n d)`` of blocks, which :meth:`with_anchors` was told of."""
+        """``(…, d, n d)`` covariance of closures and ``(…)`` blocks, which :meth:`with_anchors` has been given."""
         count, told = len(self.anchors), self.at_anchors.T
         told = told.reshape(count, len(told) // max(count, 1), len(self.covariance))
         return np.asarray(told[np.searchsorted(self.anchors, blocks)])
 
     def _with_all(self, parts: tuple[_Rows, ...], columns: np.ndarray) -> np.ndarray:
-        """``(n d, m)`` products of some ``parts`` with ``((K + R) d, m)``."""
+        """``(n d, m)`` products of all parts' columns with those of ``((K + R) d, m)``."""
         return np.concatenate([np.empty((0, columns.shape[1])), *(part.with_each(columns) for part in parts)])
 
 
 @compiled
 def _add_rows(total: np.ndarray, index: np.ndarray, value: np.ndarray) -> None:
-    """``(s, q)`` to the rows ``(s,)`` of ``total``, each of which is named once."""
+    """Add ``(s, q)`` to the rows ``(s,)`` of ``total``; no row occurs twice."""
     for i in range(len(index)):
         for j in range(value.shape[1]):
             total[index[i], j] += value[i, j]

@@ -1,9 +1,10 @@
-"""Closures that have come since the last solve, by the normal density that its answer is: judged and reckoned in.
+"""Judges closures that arrived since the last solve, and includes the good ones, by linearisation about that solve.
 
-Of new closures' residuals r all else says N(0, S), S = A H⁻¹ Aᵀ + what odometry since errs + their own noise. Those
-that are good move the unknowns by H⁻¹ Aᵀ S⁻¹ r (the matrix inversion lemma, as recursive least squares has it), which
-costs a solve with the factor that is there for each component of each closure, and no factorisation. It is as exact as
-the last solve's tangent: noise, labels and FineNet's weights stay as they were until the next solve.
+The unknowns of the last solve are N(0, H⁻¹) about their estimates. So the residuals r of new closures are N(0, S), with
+S = A H⁻¹ Aᵀ + the variance of odometry since then + their own noise. The good ones move the unknowns by H⁻¹ Aᵀ S⁻¹ r
+(the matrix inversion lemma, as in recursive least squares). This takes one solve with the existing factor for each
+component of each closure, and no factorisation. It is as exact as the linearisation; noise, labels and FineNet's
+weights stay as they are until the next solve.
 """
 
 from __future__ import annotations
@@ -33,23 +34,23 @@ from rotavg_ros.view_graph import ViewGraph
 
 # Number of closures whose columns are computed at once.
 _AT_ONCE = 8
-# Rounds of judging the new closures, each given the ones that were good in the last.
+# Maximum number of rounds of judging the new closures, each given those that were good in the round before.
 _ROUNDS = 3
-# The precision of a translation that is not known, in that of one anywhere on the map.
+# Precision of an unknown translation, relative to that of one anywhere on the map.
 _NOTHING = 1e-6
-# Both variances are estimates: what closures tell leaves so much of them at least.
+# Least share of a node's variance that closures leave: both are estimates, so their difference may come out too small.
 _SUREST = 0.02
 
 
 @dataclass(frozen=True)
 class LaidOn:
-    """A graph of N' ≥ N nodes, those that came since a solve along odometry from its answer.
+    """The answer of a graph with N' ≥ N nodes; those newer than the last solve are placed along odometry.
 
     Attributes:
-        graph: calibrated.
+        graph: the calibrated graph.
         body_from_world: ``(N', 4)``.
         position: ``(N', 3)`` metres; None by rotations alone.
-        variance: ``(2, N')`` rad², m² per component.
+        variance: ``(2, N')`` rad² and m² per component, of orientations and positions.
     """
 
     graph: ViewGraph
@@ -60,12 +61,12 @@ class LaidOn:
 
 @dataclass(frozen=True)
 class Conditioned:
-    """After n new closures.
+    """The answer with n new closures.
 
     Attributes:
-        laid: with what the good ones of these move.
-        score, rotation_score: ``(n,)`` probability that each is false, and that its rotation is.
-        columns: of those that could be reckoned in.
+        laid: the answer after the good ones among them have moved it.
+        score, rotation_score: ``(n,)`` probability that each closure is false, and that its rotation is.
+        columns: columns of the closures that are included.
     """
 
     laid: LaidOn
@@ -77,15 +78,16 @@ class Conditioned:
 def conditioned(
     linear: Linear, laid: LaidOn, growth: Growth, edge: np.ndarray, columns: Columns, most: int
 ) -> Conditioned:
-    """New closures judged, and those that are good reckoned in.
+    """Judges new closures and includes the good ones.
 
     Args:
-        linear: of the last solve.
-        laid: the graph, along odometry from that.
-        growth: how its nodes hang on those of the last solve.
-        edge: ``(n,)`` the closures, in the order in which they came.
-        columns: of the first ones.
-        most: closures whose columns are computed now, at most; the rest get scores by residual, and move nothing.
+        linear: the last solve.
+        laid: the answer, with new nodes placed along odometry from that solve.
+        growth: how the new nodes are attached to those of the last solve.
+        edge: ``(n,)`` the new closures, in the order of their arrival.
+        columns: columns of the first of them, as computed so far.
+        most: maximum number of closures whose columns are computed now; the rest are scored independently of each other
+            and move nothing.
     """
     system = _System.of(linear, laid, growth, edge)
     known = len(columns.edge)
@@ -112,16 +114,20 @@ def conditioned(
 
 @dataclass(frozen=True)
 class _System:
-    """Rows of n new closures.
+    """The rows of n new closures (N' nodes, d components in q columns).
 
     Attributes:
-        older: ``(n,)`` the end of each by whose axes its translation counts.
-        anchor: ``(N',)`` node of the last solve that each node moves with, its own among these.
-        way: ``(N', 3)`` metres from there.
-        along: ``(2, N')`` rad², m², by which odometry from there errs.
-        residual: ``(n, d, q)``, q = 1, or d = 1 and q = 3 by rotations alone.
-        own: ``(2, n)`` rad², m², of good closures, as if all stated what is typical.
-        is_known: ``(n,)`` bool, whether their translations are.
+        linear: the last solve.
+        laid: the answer, with new nodes placed along odometry.
+        source, target: ``(n,)`` their ends.
+        older: ``(n,)`` the end in whose axes each translation is stated.
+        anchor: ``(N',)`` node of the last solve that each node moves with; for nodes of that solve, the node itself.
+        way: ``(N', 3)`` metres from the anchor.
+        along: ``(2, N')`` rad² and m², variance of odometry from the anchor.
+        residual: ``(n, d, q)``: q = 1; or by rotations alone, d = 1 and q = 3.
+        displacement: ``(n, 3)`` metres, measured translations in the world; 0 where unknown.
+        own: ``(2, n)`` rad² and m², variances of good closures of typical stated variance.
+        is_known: ``(n,)`` bool, whether their translations are known.
     """
 
     linear: Linear
@@ -190,13 +196,13 @@ class _System:
 
     @property
     def _widths(self) -> tuple[int, int]:
-        """Components of turns and of shifts in a row."""
+        """Number of components of turns, and of shifts, in a row."""
         turns, shifts = self.linear.turns, self.linear.shifts
         return (1, 0) if turns is None or shifts is None else (turns.shape[1], shifts.shape[1])
 
     @property
     def anchors(self) -> np.ndarray:
-        """``(2, n)`` blocks that new nodes lie between."""
+        """``(2, n)`` blocks between which the anchors of the new nodes lie."""
         anchor = self.anchor[self.linear.num_nodes :]
         return np.stack((self.linear.above[anchor], self.linear.below[anchor]))
 
@@ -207,7 +213,7 @@ class _System:
         return np.asarray(rows.toarray().T.reshape(linear.num_blocks, d, -1))
 
     def _rows(self, which: slice) -> csr_array:
-        """``(n d, (K + R) d)`` A."""
+        """``(n d, (K + R) d)`` A of some closures."""
         linear, (k, m), d = self.linear, self._widths, self.linear.size
         source, target = self.source[which], self.target[which]
         count = len(source)
@@ -231,14 +237,14 @@ class _System:
         return csr_array((np.stack(values).ravel(), (row.ravel(), column.ravel())), shape=shape)
 
     def _crossed(self, vector: np.ndarray) -> np.ndarray:
-        """``(n, m, k)`` of v × in the axes."""
+        """``(n, m, k)`` matrices of v × in the axes of shifts and turns."""
         turns, shifts = self.linear.turns, self.linear.shifts
         assert turns is not None and shifts is not None
         crossing = np.cross(turns.T[None], shifts.T[:, None]).reshape(-1, 3).T
         return np.asarray((vector @ crossing).reshape(len(vector), shifts.shape[1], turns.shape[1]))
 
     def covariance(self, by_columns: np.ndarray, count: int) -> np.ndarray:
-        """``(n, d, n, d)`` S of the first closures, by A H⁻¹ Aᵀ ``(n d, n d)``."""
+        """``(n, d, n, d)`` S of the first ``count`` closures, given A H⁻¹ Aᵀ ``(n d, n d)``."""
         d, (k, m) = self.linear.size, self._widths
         between: np.ndarray = by_columns.reshape(count, d, count, d).copy()
         walked = self._walked(np.stack((self.target[:count], self.source[:count])), np.array([1.0, -1.0]), count)
@@ -250,32 +256,33 @@ class _System:
         return between
 
     def _walked(self, node: np.ndarray, sign: np.ndarray, count: int) -> np.ndarray:
-        """``(2, m, n)`` rad², m², what errors that odometry has made since have in common with those of closures.
+        """``(2, m, n)`` rad² and m²: covariance of nodes and closures' residuals, by odometry since the last solve.
 
         Args:
-            node: ``(s, m)`` nodes, which count with a sign each.
-            sign: ``(s,)`` theirs.
-            count: n, of the first closures.
+            node: ``(s, m)`` nodes; the errors of each column are summed with the signs.
+            sign: ``(s,)`` ±1.
+            count: n, number of closures, the first ones.
         """
         return _shared_way(self.anchor, self.along, node, sign, np.stack((self.target[:count], self.source[:count])))
 
     def _besides(self, which: slice) -> np.ndarray:
-        """``(2, n)`` rad², m², closures' own noise and what nodes err between key nodes."""
+        """``(2, n)`` rad² and m²: closures' own noise, plus the errors of their ends relative to the key nodes."""
         ends = self.anchor[self.source[which]], self.anchor[self.target[which]]
         return np.asarray(self.own[:, which] + self.linear.bridge[:, ends[0]] + self.linear.bridge[:, ends[1]])
 
     def independent(self, which: slice) -> np.ndarray:
-        """``(n, d, d)`` covariance of residuals, as if closures' ends erred by themselves."""
+        """``(n, d, d)`` covariance of residuals, as if the errors of closures' ends were independent."""
         variance = self.own[:, which] + sum(self.laid.variance[:, end[which]] for end in (self.source, self.target))
         of_row = np.repeat(variance, self._widths, axis=0).T
         return np.asarray(of_row[:, :, None] * np.eye(self.linear.size))
 
     def log_odds(self, mean: np.ndarray, covariance: np.ndarray, which: slice) -> tuple[np.ndarray, np.ndarray]:
-        """``(n,)`` nats each, that closures are good, and that their rotations are.
+        """``(n,)`` log-odds that closures are good, and that their rotations are.
 
         Args:
-            mean, covariance: ``(n, d, q)``, ``(n, d, d)`` of residuals, by all else.
-            which: closures.
+            mean: ``(n, d, q)`` residuals relative to the prediction by all else.
+            covariance: ``(n, d, d)`` of these, including the closures' own noise.
+            which: the closures.
         """
         linear, priors, (k, m) = self.linear, SlamPriors(), self._widths
         share, count = priors.outlier_share, priors.outlier_count
@@ -296,7 +303,7 @@ class _System:
         return np.where(self.is_known[which], both, rotation), rotation
 
     def moved(self, columns: Columns, by: Given) -> LaidOn:
-        """All nodes, as those of the closures with columns move them that are given."""
+        """The answer after the given closures have moved all nodes."""
         accepted, precision = by.is_given, by.precision
         if not accepted.any():
             return self.laid
@@ -308,7 +315,7 @@ class _System:
         step = columns.moves(linear, pull.reshape(-1, q))
         new = np.arange(linear.num_nodes, len(self.anchor))
         walked = self._walked(new[None], np.ones(1), count)
-        # Vectors of the world: one for each block, and what new nodes have besides.
+        # Vectors of the world frame: for each block, and for new nodes in addition.
         turn, walked_turn = step[:, :k], np.einsum("nc,cdq->ndq", walked[0], pull[:, :k])
         turn, walked_turn = (
             each[:, 0] if linear.turns is None else each[:, :, 0] @ linear.turns.T for each in (turn, walked_turn)
@@ -324,11 +331,11 @@ class _System:
         return replace(laid, body_from_world=orientation, position=position)
 
     def _surer(self, columns: Columns, precision: np.ndarray, accepted: np.ndarray) -> np.ndarray:
-        """``(2, N')`` rad², m² of nodes: of new ones with what closures tell of them; older ones stay as they were.
+        """``(2, N')`` rad² and m², variances of nodes, reduced by the closures for new nodes only.
 
         Args:
-            columns: of n closures.
-            precision: ``(a d, a d)`` S⁻¹ of those that are accepted.
+            columns: columns of n closures.
+            precision: ``(a d, a d)`` S⁻¹ of the accepted ones.
             accepted: ``(n,)`` bool.
         """
         linear, d, (k, m), count = self.linear, self.linear.size, self._widths, len(accepted)
@@ -368,7 +375,14 @@ def _log_normal(mean: np.ndarray, covariance: np.ndarray, times: int) -> np.ndar
 def _shared_way(
     anchor: np.ndarray, along: np.ndarray, node: np.ndarray, sign: np.ndarray, end: np.ndarray
 ) -> np.ndarray:
-    """``(2, m, n)``: of nodes ``(s, m)`` and closures' targets and sources ``(2, n)`` with one anchor, the lesser."""
+    """``(2, m, n)`` covariances; two nodes with the same anchor share the shorter of their ways from it.
+
+    Args:
+        anchor: ``(N',)`` node of the last solve that each node moves with.
+        along: ``(2, N')`` variance of odometry from there.
+        node, sign: ``(s, m)`` nodes, and the sign ``(s,)`` of each row.
+        end: ``(2, n)`` closures' targets, which count positive, and sources, which count negative.
+    """
     total = np.zeros((2, node.shape[1], end.shape[1]))
     for i in range(node.shape[1]):
         for j in range(end.shape[1]):

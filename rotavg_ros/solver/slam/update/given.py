@@ -12,11 +12,11 @@ from rotavg_ros.solver.algebra.small_matrices import inverse
 
 @dataclass(frozen=True)
 class Given:
-    """Some of n closures, whose residuals are given.
+    """A subset of n closures whose residuals are given.
 
     Attributes:
-        is_given: ``(n,)`` bool.
-        precision: ``(g d, g d)`` inverse of their covariance.
+        is_given: ``(n,)`` bool, the subset.
+        precision: ``(g d, g d)`` inverse covariance of its residuals.
     """
 
     is_given: np.ndarray
@@ -24,18 +24,18 @@ class Given:
 
     @classmethod
     def of(cls, covariance: np.ndarray, is_given: np.ndarray) -> Given:
-        """By the covariance ``(n, d, n, d)`` of all."""
+        """From the covariance ``(n, d, n, d)`` of all closures."""
         count = int(is_given.sum()) * covariance.shape[1]
         among = covariance[is_given][:, :, is_given].reshape(count, count)
         return cls(is_given, inverse_of_positive((among + among.T) / 2))
 
     def left_out(self, covariance: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals ``(n, d, q)`` less what those that are given say of them, and their covariances ``(n, d, d)``.
+        """Residuals ``(n, d, q)`` minus their conditional means given the subset, and the covariances ``(n, d, d)``.
 
-        Of one that is given the others say it.
+        A closure of the subset is conditioned on its other members.
 
         Args:
-            covariance: ``(n, d, n, d)``.
+            covariance: ``(n, d, n, d)`` of all closures.
             residual: ``(n, d, q)``.
         """
         count, size = residual.shape[:2]

@@ -20,10 +20,12 @@ def begins_with(graph: ViewGraph, earlier: ViewGraph, count: int | None = None) 
 
 
 def carried_over(value: np.ndarray, closure_graph: ClosureGraph, otherwise: float) -> np.ndarray:
-    """Values ``(M,)`` of the earlier graph's edges → those of the closure graph ``(E,)``; a segment's least.
+    """Values ``(M,)`` of the earlier graph's edges → those of the closure graph ``(E,)``; for a segment, the minimum.
 
     Args:
-        otherwise: of edges that are new.
+        value: of the earlier graph's edges, which are the first of the graph.
+        closure_graph: the contraction of the grown graph.
+        otherwise: value of new edges.
     """
     of_edge = np.full(len(closure_graph.segment_of_edge), otherwise)
     of_edge[: len(value)] = value
@@ -35,17 +37,17 @@ def carried_over(value: np.ndarray, closure_graph: ClosureGraph, otherwise: floa
 
 
 def thinned_out(value: np.ndarray, earlier: ViewGraph, graph: ViewGraph, otherwise: float) -> np.ndarray | None:
-    """Values ``(M,)`` of an earlier graph's closures → edges of one that has lost keyframes and edges since, ``(M',)``.
+    """Values ``(M,)`` of an earlier graph → ``(M',)`` of a graph that has lost keyframes and edges since.
 
-    A closure is known by what it measures, to the last bit; nodes have other numbers since. Odometry has 1.
+    Closures are recognised by their measured rotation, bit by bit, since nodes are renumbered. Odometry gets 1.
 
     Args:
-        value: of the earlier graph's edges.
+        value: values of the earlier graph's edges.
         earlier, graph: the graphs.
-        otherwise: of closures that are new.
+        otherwise: value of new closures.
 
     Returns:
-        None if more closures are new than known, or labels have changed.
+        The values; None if fewer than half of the closures are known, or if labels have changed.
     """
     old, new = (np.flatnonzero(~each.is_odometry.numpy()) for each in (earlier, graph))
     if len(old) == 0 or len(new) == 0:
@@ -65,6 +67,6 @@ def thinned_out(value: np.ndarray, earlier: ViewGraph, graph: ViewGraph, otherwi
 
 
 def _measured(graph: ViewGraph, edges: np.ndarray) -> np.ndarray:
-    """``(n,)`` the bytes of what edges measure."""
+    """``(n,)`` bytes of the rotations that edges measure."""
     rows = np.ascontiguousarray(graph.target_from_source.numpy()[edges])
     return rows.view(f"V{rows.shape[1] * rows.itemsize}").ravel()

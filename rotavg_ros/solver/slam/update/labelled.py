@@ -22,20 +22,21 @@ from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
 from rotavg_ros.solver.slam.update.grown_edges import carried_over
 from rotavg_ros.view_graph import ViewGraph
 
-# Units of work for each edge, of each part of what an update does beside all that others count.
+# Units of work per edge, for each part of an update that is not counted elsewhere.
 _EDGE = 0.002
-# In the place of a label that is not known; more than any.
+# Stands for an unknown label; larger than any label, so that it loses against a known one of the same segment.
 UNKNOWN = 2.0
 
 
 class Labelled(NamedTuple):
-    """What is known of a graph of M edges.
+    """The known labels of a graph of M edges.
 
     Attributes:
-        trusted: ``(m,)`` of its first edges, 1 for good closures and sound odometry, 0 for others, :data:`UNKNOWN`.
-        noise: of that labelling, to begin with.
-        calibration: what to take out of all measurements of a kind, if anything.
-        by_places: whether translations have told the labels, which rotations alone must not change then.
+        trusted: ``(m,)`` labels of its first edges: 1 for good closures and sound odometry, 0 for others, or
+            :data:`UNKNOWN`.
+        noise: noise of that labelling, to begin with.
+        calibration: what to remove from the measurements, if anything.
+        by_places: whether the labels were decided by translations, too; rotations alone then must not change them.
     """
 
     trusted: np.ndarray
@@ -45,13 +46,13 @@ class Labelled(NamedTuple):
 
 
 class SolvedFrom(NamedTuple):
-    """What it leads to.
+    """The result of a solve from labels.
 
     Attributes:
         published: the answer, by rotations alone.
-        mode: the labelling, with noise as FineNet has it.
-        trusted: ``(M,)``, of all edges.
-        noise: before FineNet.
+        mode: the labelling, with FineNet's noise.
+        trusted: ``(M,)`` labels of all edges.
+        noise: noise before FineNet.
     """
 
     published: Published
@@ -63,13 +64,13 @@ class SolvedFrom(NamedTuple):
 def solved_from(
     labelled: Labelled, graph: ViewGraph, networks: tuple[SlamCleanNet, SlamFineNet], body_from_world: Tensor
 ) -> SolvedFrom:
-    """Solve a graph, some or all of whose labels are known.
+    """Solve a graph some or all of whose labels are known.
 
     Args:
-        labelled: what is known of it.
+        labelled: the known labels.
         graph: N nodes.
-        networks: CleanNet and FineNet, which is applied once.
-        body_from_world: ``(N, 4)`` start, by which closures whose labels are not known are judged.
+        networks: CleanNet and FineNet; FineNet is applied once.
+        body_from_world: ``(N, 4)`` start; it also decides the labels that are not known.
     """
     drawn = Drawn.of(graph, networks[0], calibration=labelled.calibration)
     problem = drawn.problem

@@ -16,33 +16,33 @@ from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.poses.state import PoseNoise
 from rotavg_ros.solver.slam.posterior.mode import Mode
 
-# Of a factor, that a column passes in one unit of work; half a column passes only what is eliminated after a closure's
-# ends, a tenth of it, and takes four times as long for each entry, few columns at a time.
+# Entries of a factor that a column passes per unit of work. Half a column passes only what is eliminated after a
+# closure's ends, a tenth of it, and takes four times as long per entry because few columns are solved at once.
 _ENTRIES, _PASSED = 1.2e6, 0.4
 
 
 @dataclass(frozen=True)
 class Linear:
-    """For N nodes and M edges; k components of turns and, where translations are known, m of shifts, d = k + m.
+    """The approximation for N nodes and M edges, with k components of turns and m of shifts; d = k + m.
 
-    Rotations alone have one unknown for all components of a turn: there d is 1, k says how many these are.
+    By rotations alone all components of a turn share one system: then d is 1, and ``components`` tells k.
 
     Attributes:
         num_edges: M.
-        above, below: ``(N,)`` key nodes that each node lies between.
+        above, below: ``(N,)`` key nodes between which each node lies.
         share: ``(2, N)`` how far from the one to the other, for turns and for shifts.
-        bridge: ``(2, N)`` rad², m², by which a node errs besides.
+        bridge: ``(2, N)`` rad² and m², variance of each node relative to the interpolation.
         num_blocks: K + R.
         components: k.
-        turns, shifts: ``(3, k)``, ``(3, m)`` axes; None by rotations alone, all three then.
-        noise: how far odometry and closures err; 0 metres by rotations alone.
-        good, false: how many closures are.
-        extent: m² per component, of the map.
-        left: of columns ``(K + R, d, n)``, ``((K + R) d, n)``, and …
-        half: of what is left of them, ``((K + R) d, n)``: products of the one with the other are products of columns
-            with H⁻¹ between them.
-        ended: H⁻¹ of columns ``(K + R, d, n)``, by their halves.
-        column_work: units that one column costs.
+        turns, shifts: ``(3, k)`` and ``(3, m)`` axes; None by rotations alone, whose axes are x, y and z.
+        noise: variances of odometry and closures; those of translations are 0 by rotations alone.
+        good, false: number of good closures, and of false ones.
+        extent: m² per component, variance of the distance between two places of the map.
+        left: function from columns ``(K + R, d, n)`` to ``((K + R) d, n)`` and …
+        half: … from its result to ``((K + R) d, n)``, such that leftᵀ half are the products of the columns with H⁻¹
+            between them.
+        ended: function from half columns to H⁻¹ of the columns ``(K + R, d, n)``.
+        column_work: units of work per column.
     """
 
     num_edges: int
@@ -70,7 +70,7 @@ class Linear:
 
     @property
     def size(self) -> int:
-        """How many components a node has, d."""
+        """Number of components of a node, d."""
         return 1 if self.turns is None or self.shifts is None else self.turns.shape[1] + self.shifts.shape[1]
 
     @classmethod
@@ -111,7 +111,7 @@ class Linear:
     def of_poses(cls, pose: PoseMode) -> Linear:
         """From a joint solve."""
         problem, solved, drawn = pose.problem, pose.solved, pose.problem.drawn
-        # Between ticks a turn counts as one about any axis.
+        # A single mean variance for all axes.
         turn = problem.mean_turn(pose.state.noise)
         noise = replace(pose.state.noise, turn=turn, tilt=turn)
         turns, shifts = problem.bases

@@ -99,13 +99,13 @@ class SlamMemory:
     def of(
         cls, graph: ViewGraph, calibration: Calibration | None, mode: Mode, estimate: Estimate, is_divided: bool
     ) -> SlamMemory:
-        """After a whole search.
+        """The memory after a whole search.
 
         Args:
-            graph: that was solved.
-            calibration: what was taken out of its measurements, if anything.
-            mode: the labelling to go on from.
-            estimate: what was published, by rotations alone.
+            graph: the graph that was solved.
+            calibration: what was removed from its measurements, if anything.
+            mode: the labelling to continue from.
+            estimate: the published answer, by rotations alone.
             is_divided: whether another answer is nearly as likely.
         """
         problem, state = mode.problem, mode.state
@@ -123,14 +123,14 @@ class SlamMemory:
         body_from_world: Tensor,
         contradicting: np.ndarray,
     ) -> SearchedOn:
-        """Solve a graph that has grown from one of which nothing else is left.
+        """Solve a graph, of which only the labels of an earlier solve are left.
 
         Args:
-            labels: of :attr:`labels`.
+            labels: those of :attr:`labels`.
             graph: N nodes.
-            networks: CleanNet and FineNet, which is applied once.
+            networks: CleanNet and FineNet; FineNet is applied once.
             body_from_world: ``(N, 4)`` start.
-            contradicting: ``(n,)`` edges that are new and false, to begin with.
+            contradicting: ``(n,)`` new closures that are initially false.
         """
         trusted = np.append(labels.trusted, np.full(graph.num_edges - len(labels.trusted), np.nan))
         trusted = np.where(np.isnan(trusted), UNKNOWN, trusted)
@@ -150,14 +150,14 @@ class SlamMemory:
 
     @property
     def labels(self) -> KeptLabels | None:
-        """What :meth:`of_labels` needs; None where odometry is held to have jumped, of which labels say nothing."""
+        """The input of :meth:`of_labels`; None if odometry's position has jumped, which labels do not state."""
         poses, calibration = self.poses, np.zeros(0) if self.calibration is None else self.calibration.vector
         places, noise = np.zeros((0, len(self.trusted)), np.float32), np.zeros(0)
         if poses is not None:
             if poses.pose.problem.jump is not None:
                 return None
             places, noise = poses.kept(len(self.trusted)), np.array(astuple(poses.noise))
-        # A search that was due, or under way, is due wherever they are gone on from.
+        # A search that is due or under way is due for whoever continues from the labels.
         unexplained = self.unexplained if self.ahead is None else self.with_all_unexplained().unexplained
         search = np.array([self.searched, unexplained, self.is_divided], dtype=np.float64)
         return KeptLabels(self.graph, self.trusted, np.array(astuple(self.noise)), calibration, places, noise, search)
@@ -170,21 +170,21 @@ class SlamMemory:
         return grown or self.unexplained > _MAX_UNEXPLAINED * self.searched
 
     def with_all_unexplained(self) -> SlamMemory:
-        """The same, but that the whole search is due."""
+        """The memory, marked so that a whole search is due."""
         return replace(self, unexplained=self.searched + 1)
 
     def with_poses(self, poses: PoseMemory) -> SlamMemory:
-        """The same with what is known of places, by which closures' labels go."""
+        """The memory with that of poses, whose judgement of rotations replaces closures' labels."""
         trusted = self.trusted.copy()
         trusted[poses.edge] = poses.places.rotation_good > _GOOD
         return replace(self, poses=poses, trusted=trusted)
 
     def since(self, before: SlamMemory, score: Tensor) -> SlamMemory:
-        """The same, with a count of what the labelling does not explain since the whole search.
+        """The memory, with the count of closures that the labelling does not explain brought up to date.
 
         Args:
-            before: of the solve before.
-            score: ``(M,)`` that is published.
+            before: memory of the solve before.
+            score: ``(M,)`` published scores.
         """
         if self.graph.num_edges == before.graph.num_edges:
             return self
@@ -196,13 +196,13 @@ class SlamMemory:
         return replace(self, unexplained=before.unexplained + flagged + turned)
 
     def is_grown_to(self, graph: ViewGraph) -> bool:
-        """Whether a graph has grown from this one, which states nothing twice, and does not either."""
+        """Whether ``graph`` has grown from this memory's graph, by edges that repeat no measurement."""
         return begins_with(graph, self.graph) and not repeats_since(graph, self.graph.num_edges)
 
     def thinned_to(self, graph: ViewGraph) -> SlamMemory | None:
-        """The labels of a graph that has lost keyframes since, for :meth:`updated`; None where that would not do.
+        """The memory for a graph that has lost keyframes, as input of :meth:`updated`; None if that is impossible.
 
-        Where odometry slipped, or jumped, is not known any more once edges of it were drawn together.
+        It is impossible if odometry slipped or jumped: where, is no longer known once steps have been merged.
         """
         odometry = self.graph.is_odometry.numpy()
         if graph.num_nodes >= self.graph.num_nodes:
@@ -226,8 +226,8 @@ class SlamMemory:
 
         Args:
             graph: N nodes.
-            networks: CleanNet and FineNet, which is applied once.
-            body_from_world: ``(N, 4)`` start, where a closure is new.
+            networks: CleanNet and FineNet; FineNet is applied once.
+            body_from_world: ``(N, 4)`` start; it also decides the labels of new closures.
         """
         labelled = Labelled(self.trusted, self.noise, self.calibration, self.poses is not None)
         found = solved_from(labelled, graph, networks, body_from_world)
@@ -245,12 +245,12 @@ class SlamMemory:
         return SearchedOn(replace(estimate, memory=memory), found.mode)
 
     def along_odometry(self, graph: ViewGraph, new: Growth) -> Estimate | None:
-        """The answer with odometry alone, on which new nodes hang; None where that has lost its translations.
+        """The answer of a graph that has grown by odometry alone; None if the graph has no translations any more.
 
-        Variances grow by the steps passed, whatever odometry does in turns.
+        Variances grow with the number of steps, not with their turns.
 
         Args:
-            graph: grown from this one, by odometry alone.
+            graph: the graph, grown by odometry alone.
             new: its new nodes.
         """
         edge = np.arange(self.graph.num_edges, graph.num_edges)
@@ -282,7 +282,7 @@ class SlamMemory:
         return estimate if poses is None else with_poses(graph, estimate, poses)
 
     def calibrated(self, graph: ViewGraph) -> ViewGraph:
-        """The graph without what its measurements have wrong alike, as far as that was taken out."""
+        """The graph without the systematic errors that were found, if any."""
         return calibrated(graph, self.calibration)
 
 
@@ -298,9 +298,9 @@ def estimate_of(published: Published) -> Estimate:
 
 
 def with_poses(graph: ViewGraph, estimate: Estimate, memory: PoseMemory) -> Estimate:
-    """The estimate of rotations alone, with orientations, positions and closures' scores by translations as well.
+    """The estimate of rotations alone, with orientations, positions and scores replaced by those of poses.
 
-    Whether odometry slipped is told by rotations, whether its position jumped by translations.
+    Slips of odometry are decided by rotations, jumps of its position by translations.
     """
     poses, goes_on = memory.poses, estimate.memory
     slipped, is_odometry = estimate.outlier_score, graph.is_odometry

@@ -1,4 +1,4 @@
-"""All nodes of a graph that has grown, after the blocks of the last solve's system have moved."""
+"""Poses of all nodes of a graph that has grown, after a step of the last solve's unknowns."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from rotavg_ros.solver.algebra.quaternion_loops import Vector, canonical, exp, i
 
 
 class Hangs(NamedTuple):
-    """Where N' nodes hang, of which the last solve had N.
+    """How N' nodes are attached to the N nodes of the last solve, and these to its blocks.
 
     Attributes:
-        anchor: ``(N',)`` the node of the last solve that each hangs on.
+        anchor: ``(N',)`` the node of the last solve that each moves with.
         above, below: ``(N,)`` blocks between which each of these lies.
-        share: ``(2, N)`` how far, in turns and in shifts.
+        share: ``(2, N)`` how far from the one to the other, for turns and for shifts.
     """
 
     anchor: np.ndarray
@@ -27,7 +27,7 @@ class Hangs(NamedTuple):
 
 @compiled
 def _between(hangs: Hangs, kind: int, of_block: np.ndarray, v: int) -> Vector:
-    """Of ``of_block`` ``(K + R, 3)``, turns (0) or shifts (1), what node v's anchor has."""
+    """Step of node v's anchor, interpolated from those of blocks ``(K + R, 3)``: turns (kind 0) or shifts (1)."""
     node = hangs.anchor[v]
     share, above, below = hangs.share[kind, node], hangs.above[node], hangs.below[node]
     return (
@@ -39,7 +39,7 @@ def _between(hangs: Hangs, kind: int, of_block: np.ndarray, v: int) -> Vector:
 
 @compiled
 def turned(hangs: Hangs, turn: np.ndarray, walked: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """``(N', 4)`` orientations after turns of blocks ``(K + R, 3)``, and of new nodes by ``(n, 3)`` besides, w ≥ 0."""
+    """``(N', 4)`` orientations after turns of blocks ``(K + R, 3)`` and additional ones of new nodes ``(n, 3)``."""
     found, first = np.empty_like(before), len(hangs.above)
     for v in range(len(hangs.anchor)):
         x, y, z = _between(hangs, 0, turn, v)
@@ -54,7 +54,7 @@ def turned(hangs: Hangs, turn: np.ndarray, walked: np.ndarray, before: np.ndarra
 def shifted(
     hangs: Hangs, turn: np.ndarray, shifts: tuple[np.ndarray, np.ndarray], way: np.ndarray, before: np.ndarray
 ) -> np.ndarray:
-    """``(N', 3)`` positions likewise; the way ``(N', 3)`` of a new node from its anchor turns with that."""
+    """``(N', 3)`` positions after shifts, likewise; the way ``(N', 3)`` from its anchor turns with the anchor."""
     (shift, walked), found, first = shifts, np.empty_like(before), len(hangs.above)
     for v in range(len(hangs.anchor)):
         x, y, z = _between(hangs, 1, shift, v)
