@@ -60,7 +60,7 @@ class Evidence:
 
     @classmethod
     def of(cls, problem: Problem, state: State) -> Evidence:
-        """After a solve at ``state``, which knows what all others say of each edge."""
+        """After a solve, whose ``state`` holds the prediction of each edge by all others."""
         graph, num_edges = problem.graph, len(problem.graph.source)
         residual, variance = residuals(problem, state), variances(problem, state.noise)
         own, site = variance[:num_edges], sites(problem, state, residual, variance)
@@ -93,7 +93,7 @@ class Evidence:
 
 
 def _of_segments(shared_out: np.ndarray, problem: Problem) -> np.ndarray:
-    """``(E,)`` steps as shared out among segments over how many they are; 1 of all other edges."""
+    """``(E,)`` redistributed steps of segments over their actual number; 1 for all other edges."""
     graph = problem.graph
     is_known = graph.is_odometry & (graph.own_steps > 0)
     return np.asarray(np.divide(shared_out, graph.own_steps, out=np.ones(len(shared_out)), where=is_known))

@@ -83,7 +83,7 @@ def fine_features(evidence: Evidence) -> FineFeatures:
 
 
 def joined(several: Sequence[FineFeatures]) -> FineFeatures:
-    """Several graphs as one that falls apart into them."""
+    """The features of several graphs as those of one graph with several components."""
     first = np.concatenate(([0], np.cumsum([features.num_nodes for features in several])))
     return FineFeatures(
         torch.cat([features.edges for features in several]),
@@ -96,7 +96,7 @@ def joined(several: Sequence[FineFeatures]) -> FineFeatures:
 
 
 class _Pool:
-    """Sums of a z² and a over groups of E edges, and what they say."""
+    """Sums of a z² and a over groups of E edges, and the features that follow from them."""
 
     def __init__(self, told: np.ndarray, square: np.ndarray) -> None:
         self.told = told
@@ -105,29 +105,29 @@ class _Pool:
 
     @staticmethod
     def says(sums: np.ndarray) -> list[np.ndarray]:
-        """Of sums ``(n, 2)``: the logarithm of variance over estimate, and how much tells of it."""
+        """For sums ``(n, 2)``: log ratio of actual to estimated variance, and how informative it is."""
         return [np.log((sums[:, 0] + 1) / (sums[:, 1] + 1)), np.log1p(sums[:, 1]) / 2]
 
     def sorted(self, position: np.ndarray, of: np.ndarray) -> _Sorted:
-        """Those of ``of`` ``(m,)`` by their ``position`` ``(m,)``."""
+        """The edges ``of`` ``(m,)``, sorted by ``position`` ``(m,)``."""
         order = np.argsort(position, kind="stable")
         return _Sorted(position[order], np.concatenate((np.zeros((1, 2)), np.cumsum(self.sums[of[order]], axis=0))))
 
 
 class _Sorted(NamedTuple):
-    """Edges by where they are, and sums up to each."""
+    """Edges sorted by position, with cumulative sums."""
 
     position: np.ndarray
     cumulated: np.ndarray
 
     def within(self, reach: float, at: np.ndarray) -> np.ndarray:
-        """``(n, 2)`` sums over those that are at most ``reach`` from each of ``at`` ``(n,)``."""
+        """``(n, 2)`` sums over the edges that are at most ``reach`` from each of ``at`` ``(n,)``."""
         low = self.position.searchsorted(at - reach, side="left")
         return np.asarray(self.cumulated[self.position.searchsorted(at + reach, side="right")] - self.cumulated[low])
 
 
 def _stretches(evidence: Evidence, pool: _Pool) -> list[np.ndarray]:
-    """What stretches of odometry around a segment say, and closures that end there; of closures what is near them."""
+    """Columns for segments, from stretches of odometry around them and closures near them; for closures, likewise."""
     odometry, closure = np.flatnonzero(evidence.is_odometry), np.flatnonzero(~evidence.is_odometry)
     middle = evidence.position.mean(axis=1)
     ends = evidence.position[closure]
@@ -148,14 +148,17 @@ def _stretches(evidence: Evidence, pool: _Pool) -> list[np.ndarray]:
             fill(number, closure, by_end.within(reach, ends[:, 0]) + by_end.within(reach, ends[:, 1]))
         for number, end in enumerate(ends.T, start=1 + len(_NEAR_ENDS)):
             fill(number, closure, along.within(_STRETCHES[1], end))
-        # Which end is the older one is no matter of the edge: their mean and their distance.
+        # The features must not depend on which end is the older one: their mean and absolute difference.
         older, newer = columns[6:8, closure].copy(), columns[8:10, closure].copy()
         columns[6:8, closure], columns[8:10, closure] = (older + newer) / 2, np.abs(older - newer)
     return list(columns)
 
 
 def _contrast(pool: _Pool, cause: np.ndarray, evidence: Evidence) -> list[np.ndarray]:
-    """A cause ``(E,)`` of errors less its mean over its kind, how much more errs where there is more, and both."""
+    """Three columns for a cause ``(E,)`` of errors: the cause minus its mean, its effect on the noise, their product.
+
+    The effect is the difference in log variance ratio between edges with more of the cause and edges with less.
+    """
     columns = np.zeros((3, len(cause)))
     for kind in (evidence.is_odometry, ~evidence.is_odometry):
         if not kind.any():
@@ -169,7 +172,7 @@ def _contrast(pool: _Pool, cause: np.ndarray, evidence: Evidence) -> list[np.nda
 
 
 def _of_graph(evidence: Evidence, pool: _Pool) -> list[float]:
-    """The same for all edges: how normal either kind's noise looks, what the noise was chosen to be."""
+    """Values that are the same for all edges: how normal the noise of each kind looks, and the chosen noise model."""
     values: list[float] = []
     for kind in (evidence.is_odometry, ~evidence.is_odometry):
         told, square = pool.told[kind], pool.square[kind]

@@ -1,14 +1,14 @@
-"""FineNet of the SLAM profile: predicts how far each edge errs, relative to what is estimated.
+"""FineNet of the SLAM profile: predicts the variance of each edge's noise, relative to the estimated one.
 
-The paper's FineNet turns what a tree got wrong into corrected orientations. On a robot's graph a sparse solve does that
-exactly once it is known how far each edge errs, so that is what is learned: messages go from edges to the key nodes
-between them and back, so neighbouring segments of the chain and closures at the same places hear of each other,
+The paper's FineNet corrects orientations. On a robot's graph a sparse solve does that exactly once the variance of each
+edge is known, so the variance is learned instead. Messages run from edges to their key nodes and back, so neighbouring
+segments, and closures at the same places, exchange information:
 
-    m_n ← mean over the segments at n of h, mean over the closures at n of h
+    m_n ← mean over the segments at n of relu(h), mean over the closures at n of relu(h)
     h_e ← h_e + φ(h_e, m_source + m_target)
 
-and from the last h_e a linear layer says log (variance here / variance as estimated), less its mean over all edges of
-the kind. The sums over both ends make it blind to an edge's direction.
+A linear layer on the last h_e and the features gives log (variance here / estimated variance), minus its mean over the
+good edges of the same kind. Summing over both ends makes it independent of an edge's direction.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from rotavg_ros.solver.neurora.network_store import StoredNetwork
 from rotavg_ros.solver.slam.fine_net.features import NUM_FEATURES, FineFeatures
 
 _WIDTH, _ROUNDS = 32, 3
-# A variance differs from the estimate by no more than e to this.
+# Bound of the absolute log ratio.
 _LARGEST = 5.0
 
 
 class SlamFineNet(StoredNetwork):
-    """Logarithm of every edge's variance over its estimate."""
+    """Predicts the log ratio of every edge's variance to its estimate."""
 
     NAME = "slam-fine-net"
 
@@ -42,14 +42,14 @@ class SlamFineNet(StoredNetwork):
             nn.init.zeros_(head.bias)
 
     def forward(self, features: FineFeatures) -> Tensor:
-        """``(E,)``, of mean zero over the good edges of a kind and graph; 0 for all others."""
+        """``(E,)`` log ratios, of mean zero over the good edges of each graph and kind; 0 for all other edges."""
         odometry = torch.nonzero(features.is_odometry).squeeze(1)
         closure = torch.nonzero(~features.is_odometry).squeeze(1)
         x = features.edges
         state = x.new_zeros(len(x), _WIDTH)
         state = state.index_copy(0, odometry, self.segment_encoder(x[odometry]))
         state = state.index_copy(0, closure, self.closure_encoder(x[closure]))
-        # At every node two places: for its segments, and for its closures.
+        # Two slots per node: one for its segments, one for its closures.
         place = (2 * features.ends + ~features.is_odometry).reshape(-1)
         degree = torch.bincount(place, minlength=2 * features.num_nodes)
         inverse_degree = (1 / degree.clamp(min=1).to(x))[:, None]
@@ -65,7 +65,7 @@ class SlamFineNet(StoredNetwork):
 
 
 def centred(value: Tensor, features: FineFeatures) -> Tensor:
-    """Less its mean over the good edges of each graph and kind; 0 for others."""
+    """Values minus their mean over the good edges of the same graph and kind; 0 for edges that are not good."""
     group = torch.where(features.is_good, 2 * features.graph + features.is_odometry, 0)
     good = features.is_good.to(value)
     num_groups = 2 * (int(features.graph.max()) + 1) if len(value) else 0

@@ -1,4 +1,4 @@
-"""How a robot errs, told from a run of its own; and how well a FineNet explains stretches of it that are held back."""
+"""A robot's noise, estimated from one of its runs; and how well FineNets predict stretches of it that are held back."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.rows import residuals, tails
 
-# An edge whose own noise makes up less of what is seen of it says little.
+# Edges whose own noise is a smaller part of the discrepancy's variance than this are not used.
 _TOLD = 0.5
-# Fewer say nothing of how edges of a kind differ.
+# With fewer edges of a kind, differences between them are not estimated.
 _LEAST_EDGES = 6
-# Closures are held back in stretches: most stretches, and least closures of one.
+# Closures are held back in stretches: maximum number of stretches, and least number of closures in one.
 _STRETCHES, _IN_STRETCH = 16, 6
-# Solves after closures are held back.
+# Number of solves after closures are held back.
 _SOLVES = 4
 # False closures repeat each other's turn if they agree within this, rad.
 _SAME_TURN = np.radians(5.0)
@@ -33,21 +33,21 @@ _LEAST_SHARE = 0.02
 
 @dataclass(frozen=True)
 class RobotNoise:
-    """Of one run. Angles are root mean squares over a rotation's components together.
+    """The noise of one run. Angles are root mean squares of a rotation's angle, all components together.
 
     Attributes:
-        keyframes: of it.
-        planar: all rotations are about one axis.
-        odometry_deg: usual error of a step.
-        closure_deg: usual error of a good closure.
-        closures_per_keyframe: how many there are.
-        false_share: of the closures.
-        grouped_share: of the false ones, those that agree with another one.
-        step_spread: standard deviation of the logarithm of odometry's error from stretch to stretch.
-        closure_spread: the same of good closures, from one to the next.
-        per_turn: error of odometry over the angle by which a step turns; 0 where it says nothing of that.
-        common_share: of good closures' variance, what those of a run have in common; 0 where they err independently.
-        states_precision: whether stated precisions of closures mean anything.
+        keyframes: number of keyframes.
+        planar: whether all rotations are about one axis.
+        odometry_deg: typical error of a step.
+        closure_deg: typical error of a good closure.
+        closures_per_keyframe: number of closures per keyframe.
+        false_share: share of the closures that are false.
+        grouped_share: share of the false ones that agree with another one, beyond chance.
+        step_spread: standard deviation of the logarithm of odometry's error from segment to segment.
+        closure_spread: the same for good closures, from one to the next.
+        per_turn: error of odometry over the angle by which a step turns; 0 if errors do not depend on it.
+        common_share: share of good closures' variance that those of a run have in common; 0 if they err independently.
+        states_precision: whether stated precisions of closures are informative.
     """
 
     keyframes: int
@@ -65,12 +65,13 @@ class RobotNoise:
 
 
 def robot_noise(mode: Mode, network: SlamFineNet, truth: np.ndarray | None = None) -> RobotNoise:
-    """Of a run, by its likeliest labelling.
+    """The noise of a run, from its likeliest labelling.
 
     Args:
-        mode: without FineNet.
+        mode: the labelling, without FineNet.
         network: FineNet.
-        truth: ``(4, K)`` true corrections, by which errors are known; default: by what all others say of each edge.
+        truth: ``(4, K)`` true corrections, from which errors are computed; default: discrepancies from the prediction
+            by all others are used.
     """
     problem, state = mode.problem, mode.state
     evidence = Evidence.of(problem, state)
@@ -100,14 +101,13 @@ def robot_noise(mode: Mode, network: SlamFineNet, truth: np.ndarray | None = Non
 
 
 def held_back(mode: Mode, networks: Sequence[SlamFineNet | None]) -> np.ndarray:
-    """``(B, n)`` nats a closure: how well each of n networks predicts closures of B stretches from all the others.
+    """``(B, n)`` nats per closure: log density of the closures of B stretches, predicted by all others with n networks.
 
-    Closures are good with the share of those that are, else false; what is predicted is a good one's density. None is
-    no FineNet.
+    Each closure is good with the probability 1 − share of false ones, else false. FineNet affects the prediction only.
 
     Args:
-        mode: of a whole run.
-        networks: to compare.
+        mode: labelling of a whole run.
+        networks: the networks to compare; None stands for no FineNet.
     """
     problem, closure = mode.problem, mode.problem.closure
     count = min(_STRETCHES, len(closure) // _IN_STRETCH)
@@ -128,7 +128,7 @@ def held_back(mode: Mode, networks: Sequence[SlamFineNet | None]) -> np.ndarray:
 
 
 def _density(mode: Mode, tuned: Tuned, edges: np.ndarray) -> np.ndarray:
-    """``(n,)`` nats, of closures that did not pull."""
+    """``(n,)`` nats, log densities of closures that were held back."""
     problem, noise, k = tuned.problem, tuned.state.noise, tuned.problem.components
     evidence = Evidence.of(problem, tuned.state)
     square, predicted = evidence.square[edges], evidence.predicted[edges]
@@ -142,25 +142,25 @@ def _density(mode: Mode, tuned: Tuned, edges: np.ndarray) -> np.ndarray:
 
 
 def _standardised(evidence: Evidence, kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of good edges of a kind: z² and the part of it that their own noise tells."""
+    """For good edges of a kind: z², and the part of its expectation that is due to their own noise."""
     total = evidence.own + evidence.predicted
     used = kind & evidence.is_good
     return (evidence.square / (evidence.components * total))[used], (evidence.own / total)[used]
 
 
 def _level(evidence: Evidence, kind: np.ndarray) -> float:
-    """By what the usual variance differs from the estimated one: the median of z² over that of its distribution."""
+    """Ratio of the typical variance to the estimated one: the median of z² over the median of its distribution."""
     square, told = _standardised(evidence, kind)
     clear = square[told > _TOLD]
     if len(clear) < _LEAST_EDGES:
         return 1.0
     k = evidence.components
-    # Of χ² over its degrees of freedom (Wilson and Hilferty 1931).
+    # The median of χ² over its degrees of freedom (Wilson and Hilferty 1931).
     return float(np.median(clear)) / (1 - 2 / (9 * k)) ** 3
 
 
 def _spread(evidence: Evidence, kind: np.ndarray) -> float:
-    """Standard deviation of the logarithm of σ, from that of z² beyond what χ² has."""
+    """Standard deviation of log σ, from the variance of log z² beyond that of χ²."""
     square, told = _standardised(evidence, kind)
     clear = square[told > _TOLD]
     if len(clear) < _LEAST_EDGES:
@@ -170,7 +170,7 @@ def _spread(evidence: Evidence, kind: np.ndarray) -> float:
 
 
 def _spread_along(mode: Mode, network: SlamFineNet) -> float:
-    """The same of odometry, from segment to segment as FineNet has it; each counts as often as it has steps."""
+    """The same for odometry, from segment to segment by FineNet's variances, weighted by their steps."""
     tuned = applied(network, applied(network, Tuned(mode.problem, mode.state, mode.evaluation.factorised)))
     relative, graph = tuned.problem.relative, mode.problem.graph
     assert relative is not None
@@ -181,7 +181,7 @@ def _spread_along(mode: Mode, network: SlamFineNet) -> float:
 
 
 def _per_turn(mode: Mode, evidence: Evidence) -> float:
-    """Error over angle: least squares of squared errors by steps and squared turns, none of them negative."""
+    """Error over angle, by non-negative least squares of squared errors on steps and squared turns."""
     problem = mode.problem
     segments = np.flatnonzero(evidence.is_odometry & evidence.is_good & (evidence.own > evidence.predicted))
     segments = segments[segments < problem.graph.num_segments]
@@ -190,7 +190,7 @@ def _per_turn(mode: Mode, evidence: Evidence) -> float:
     graph = problem.graph
     turned = problem.turned[graph.nodes]
     square = np.maximum(turned[graph.target[segments]] - turned[graph.source[segments]], 0.0)
-    # Each as a share of what is expected, or the worst would decide alone.
+    # Relative to the expected squares; otherwise the largest would decide alone.
     unit = evidence.components * (evidence.own + evidence.predicted)[segments]
     left = (evidence.square[segments] - evidence.components * evidence.predicted[segments]) / unit
     causes = np.stack((graph.own_steps[segments], square), axis=1) / unit[:, None]
@@ -199,7 +199,7 @@ def _per_turn(mode: Mode, evidence: Evidence) -> float:
 
 
 def _grouped(mode: Mode) -> float:
-    """Share of the false closures whose wrong turn another one of them has, less what random turns have by chance."""
+    """Share of the false closures that agree with another one, minus what random turns would give, rescaled to 0–1."""
     problem = mode.problem
     false = np.flatnonzero(mode.is_false)
     if len(false) < 2:
@@ -209,7 +209,7 @@ def _grouped(mode: Mode) -> float:
     cosine = np.abs(turn.T @ turn)
     np.fill_diagonal(cosine, 0.0)
     agree = float((cosine.max(axis=1) > np.cos(_SAME_TURN / 2)).mean())
-    # Of all rotations, those nearer than that to a given one.
+    # Probability that a random rotation is nearer than that to a given one.
     near = _SAME_TURN / np.pi if problem.components == 1 else (_SAME_TURN - np.sin(_SAME_TURN)) / np.pi
     chance = 1 - (1 - near) ** (len(false) - 1)
     return float(max(0.0, (agree - chance) / (1 - chance)))

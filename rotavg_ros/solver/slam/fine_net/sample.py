@@ -1,6 +1,6 @@
-"""A solved graph of which the truth is known, as FineNet is trained on it: what its variances make of orientations.
+"""A solved graph with known truth, on which FineNet is trained: how its variances change the error of orientations.
 
-At a labelling's optimum the solve is linear in residuals, so that of other weights comes out by one sparse solve.
+At a labelling's optimum the solve is linear in the residuals, so one sparse solve gives the result of other weights.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.posterior.rows import residuals, variances
 from rotavg_ros.solver.slam.posterior.system import NormalEquations
 
-# What a false closure weighs of a good one, and a slipped segment.
+# Weight of a false closure, or of a slipped segment, relative to a good one.
 _NOTHING = 1e-10
-# Errors below this, rad, are as good as none.
+# Added to errors before their logarithm, rad, so that smaller ones are as good as zero.
 _FLOOR = float(np.radians(0.05))
 _WEISZFELD_STEPS = 4
-# A true variance greater than what is said by more than this, in the logarithm, costs in proportion to that.
+# Log ratio of true to predicted variance beyond which the divergence grows only linearly.
 _FAR = 2.0
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What is known of a graph with K key nodes and E edges.
+    """The truth of a graph with K key nodes and E edges.
 
     Attributes:
         correction: ``(4, K)`` true corrections of the odometry's orientations, in any gauge.
@@ -45,13 +45,14 @@ class Truth:
 
 
 class Losses(NamedTuple):
-    """What variances are worth on one graph.
+    """The losses of one graph, given predicted variances.
 
     Attributes:
         log_error: log rad, of the mean error.
-        log_expected: log rad, of the root mean square error if edges erred anew by their true variances. Of one graph
-            it says far more exactly what weights are worth, but not what the errors that there are tell of themselves.
-        nats: per edge, the divergence from normal densities of the true variances, either kind's mean.
+        log_expected: log rad, of the root mean square error if edges erred anew with their true variances. On one
+            graph this measures the quality of weights far more exactly than ``log_error``, but does not tell whether
+            they suit the errors that actually occurred.
+        nats: per edge, divergence from normal densities with the true variances, summed over the means of both kinds.
     """
 
     log_error: Tensor
@@ -61,19 +62,20 @@ class Losses(NamedTuple):
 
 @dataclass(frozen=True)
 class FineSample:
-    """One solved graph (K key nodes, E edges, R runs).
+    """A solved graph (K key nodes, E edges, R runs).
 
     Attributes:
-        features: what the network sees.
+        features: the network's input.
         told: what others say of each edge.
         system: rows of the sparse solve.
         residual: ``(E + R, 3)`` rad.
-        used: ``(E,)`` rad², what edges weigh as good ones, inverted.
+        used: ``(E,)`` rad², inverse weights of edges as good ones.
         runs: ``(R,)`` rad², variances of common errors.
-        common: ``(E,)`` rad², of the error that each edge has in common with its run.
-        turn: ``(K, 3)`` rad, by which the key nodes would have to turn.
-        share: ``(K,)`` of the view-graph's nodes that lie at each; those in segments by how near they are.
-        true_variance: ``(E,)`` rad², NaN where unknown.
+        common: ``(E,)`` rad², variance of the error that each edge shares with its run.
+        turn: ``(K, 3)`` rad, turns of the key nodes that would lead to the truth.
+        share: ``(K,)`` share of the view-graph's nodes at each key node; nodes within segments count for both ends, in
+            proportion to their nearness.
+        true_variance: ``(E,)`` rad²; NaN where unknown.
     """
 
     features: FineFeatures
@@ -89,7 +91,7 @@ class FineSample:
 
     @classmethod
     def of(cls, tuned: Tuned, truth: Truth) -> FineSample:
-        """A labelling at rest."""
+        """From a labelling at its optimum."""
         problem, state = tuned.problem, tuned.state
         evidence, noise = Evidence.of(problem, state), state.noise
         system, num_edges = problem.system(noise), len(evidence.own)
@@ -110,11 +112,11 @@ class FineSample:
         )
 
     def losses(self, log_noise: Tensor, fresh: Tensor) -> Losses:
-        """What variances are worth.
+        """The losses under given variances.
 
         Args:
-            log_noise: ``(E,)`` float64, logarithms of variances over those that are used without FineNet.
-            fresh: ``(E + R, 3, F)`` standard normal: what edges might have erred by as well.
+            log_noise: ``(E,)`` float64, logarithms of variances relative to those used without FineNet.
+            fresh: ``(E + R, 3, F)`` standard normal samples, from which other errors of the edges are drawn.
         """
         kind = self.features.is_odometry.long()
         variance = self.used * log_noise.exp()
@@ -133,7 +135,7 @@ class FineSample:
         return Losses(torch.log(error + _FLOOR), torch.log(expected + _FLOOR), nats)
 
     def errors(self) -> tuple[float, float]:
-        """rad, of the nodes' orientations as they are: the mean and the largest."""
+        """Mean and largest error of the nodes' current orientations, rad, relative to their median."""
         error = _length(self.turn - self._middle(self.turn))
         return float((self.share * error).sum()), float(error.max())
 
@@ -146,7 +148,7 @@ class FineSample:
         return torch.stack([kind.mean() for kind in kinds if len(kind)]).sum()
 
     def _middle(self, turned: Tensor) -> Tensor:
-        """``(3,)`` geometric median of turns ``(K, 3)``: no gauge is learned (Weiszfeld)."""
+        """``(3,)`` geometric median of turns ``(K, 3)``, so that no gauge is learned (Weiszfeld's algorithm)."""
         share = self.share[:, None]
         middle = (share * turned).sum(dim=0)
         for _ in range(_WEISZFELD_STEPS):
@@ -161,7 +163,7 @@ def _length(vectors: Tensor) -> Tensor:
 
 
 def _gauge(correction: np.ndarray, like: np.ndarray) -> np.ndarray:
-    """``(4, 1)`` that brings corrections ``(4, K)`` nearest to others (chordal mean)."""
+    """``(4, 1)`` rotation that brings corrections ``(4, K)`` nearest to others, when multiplied from the right."""
     apart = quaternion_rows.multiply(quaternion_rows.inverse(correction), like)
     return np.asarray(np.linalg.eigh(apart @ apart.T)[1][:, -1:])
 

@@ -1,11 +1,12 @@
-"""By how much both kinds' noise changes when variances of single edges do, so that σ goes on to mean what it does.
+"""Rescales the noise of odometry and of closures when variances of single edges change, so that σ keeps its meaning.
 
-Of edges of variance v, of which all others say N(μ, p), the likeliest common factor e^y of v makes
+If all others predict edges of variance v as N(μ, p), the likeliest common factor e^y of v satisfies, but for the prior
+on σ,
 
     Σ ‖μ‖² v / (v + p)² = k Σ v / (v + p)
 
-but for the prior on σ: the redundancy that residuals leave, as the posterior estimates its noise (MacKay 1992). What
-was left of that equation before, by the prior and by tails, is left of it after.
+which is how the posterior estimates its noise (MacKay 1992). Because of the prior and of tails, the two sides differ
+before the change; their difference is kept.
 """
 
 from __future__ import annotations
@@ -15,20 +16,20 @@ from dataclasses import dataclass
 from torch import Tensor
 
 _ROUNDS = 4
-# A Newton step changes the logarithm by no more.
+# Largest change of the logarithm in one Newton step.
 _LONGEST = 1.5
 
 
 @dataclass(frozen=True)
 class Told:
-    """What others say of E edges' noise (float64).
+    """Evidence on the noise of E edges (float64).
 
     Attributes:
         is_odometry: ``(E,)`` bool.
         good: ``(E,)`` 1 for good edges, else 0.
         square, predicted: ``(E,)`` rad², ‖μ‖² and p.
         components: k.
-        noise_spread: standard deviation of the logarithm of either kind's σ, beforehand.
+        noise_spread: prior standard deviation of the logarithm of each kind's σ.
     """
 
     is_odometry: Tensor
@@ -39,7 +40,7 @@ class Told:
     noise_spread: float
 
     def log_scale(self, before: Tensor, after: Tensor) -> Tensor:
-        """``(2,)`` of the variances of closures and of odometry, when ``before`` ``(E,)`` rad² becomes ``after``."""
+        """``(2,)`` y of closures and of odometry, if variances change from ``before`` ``(E,)`` rad² to ``after``."""
         scale = after.new_zeros(2)
         prior = 1 / (2 * self.noise_spread) ** 2
         squares, freedom = self._sums(before)
@@ -51,7 +52,7 @@ class Told:
         return scale
 
     def _sums(self, variance: Tensor) -> tuple[Tensor, Tensor]:
-        """``(2,)`` squares and degrees of freedom of either kind."""
+        """``(2,)`` each: sum of squares and degrees of freedom, of closures and of odometry."""
         part = self.good * variance / (variance + self.predicted)
         squares = part * self.square / (variance + self.predicted)
         kind = self.is_odometry.long()

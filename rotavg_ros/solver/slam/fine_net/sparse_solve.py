@@ -5,7 +5,7 @@ differentiation of H δ = Jᵀ W r). So the gradient of a loss, given its gradie
 
     dL/dw_e = (J H⁻¹ g)_e · (r_e − (J δ)_e)
 
-one more solve with the factor that is there, for all weights at once.
+which takes one more solve with the existing factor, for all weights together.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ class _SparseSolve(torch.autograd.Function):
 
 
 def sparse_solve(system: NormalEquations, weight: Tensor, residual: Tensor) -> Tensor:
-    """δ ``(K + R, k)`` that explains rows best.
+    """The least-squares solution δ ``(K + R, k)``.
 
     Args:
         system: the rows J.
-        weight: ``(E + R,)`` float64, positive; gradients go to these.
-        residual: ``(E + R, k)`` float64, a constant.
+        weight: ``(E + R,)`` float64, positive; differentiable.
+        residual: ``(E + R, k)`` float64, constant.
     """
     step: Tensor = _SparseSolve.apply(weight, system, residual)  # type: ignore[no-untyped-call]
     return step

@@ -1,4 +1,4 @@
-"""A labelling's orientations with each edge weighing what FineNet says it errs by."""
+"""A labelling's orientations with the weight of each edge from the variance that FineNet predicts."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from rotavg_ros.solver.slam.posterior.system import Factorised
 
 # NeuRoRA-v2 applies its FineNet twice.
 PASSES = 2
-# What it says of a kind of edges counts once it explains them better by more nats than the first, and wholly after as
-# many more as the second: on graphs whose edges of a kind err alike it gains up to some 15 by chance.
+# FineNet is believed for a kind of edges if it explains them better by more nats than the first, and fully after as
+# many more as the second: if all edges of a kind err alike, it gains up to some 15 by chance.
 _CHANCE, _SURE = 12.0, 12.0
-# Sparse solves after each.
+# Number of sparse solves after each application.
 _SOLVES = 1
-# Fewer edges of odometry or closures tell nothing of how they differ.
+# With fewer edges of odometry, or closures, FineNet is not applied.
 _LEAST_EDGES = 3
-# Units of work for each edge: of what the network sees, and of the network.
+# Units of work per edge: for the features, and for the network.
 _SEEN, _EDGE = 0.003, 0.005
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """A labelling under weights of FineNet's.
+    """A labelling under FineNet's variances.
 
     Attributes:
-        problem: with those variances.
-        state: the same labels.
-        factorised: the last solve.
+        problem: the problem with those variances.
+        state: a state with the same labels.
+        factorised: H of its last solve.
     """
 
     problem: Problem
@@ -51,14 +51,14 @@ class Tuned:
 
 
 def fine_tuned(mode: Mode, network: SlamFineNet, passes: int = PASSES) -> Mode:
-    """The mode's labels, orientations and noise under variances that FineNet predicts.
+    """The mode's labelling under variances that FineNet predicts; the mode itself if it has too few edges of a kind.
 
-    F and so the mode's probability among its rivals stay as they were found: labellings are compared by one model.
+    F, and with it the mode's probability among its rivals, stays as found: labellings are compared by one noise model.
 
     Args:
-        mode: at its optimum.
+        mode: the mode at its optimum.
         network: FineNet.
-        passes: how often it is applied.
+        passes: number of applications.
     """
     closures = len(mode.problem.closure)
     if min(closures, len(mode.problem.graph.source) - closures) < _LEAST_EDGES:
@@ -74,7 +74,7 @@ def fine_tuned(mode: Mode, network: SlamFineNet, passes: int = PASSES) -> Mode:
 
 @torch.inference_mode()
 def applied(network: SlamFineNet, before: Tuned) -> Tuned:
-    """After FineNet once more: its variances take the place of the noise's tails."""
+    """Result of applying FineNet once more; its variances replace the noise model's tails."""
     spend(_SEEN * len(before.state.trusted))
     evidence = Evidence.of(before.problem, before.state)
     features = fine_features(evidence)
@@ -93,15 +93,15 @@ def applied(network: SlamFineNet, before: Tuned) -> Tuned:
 
 
 def believed(evidence: Evidence, edges: Told, used: Tensor, log_noise: Tensor) -> Tensor:
-    """``(E,)`` how far FineNet is believed of each kind of edges, 0 to 1, by what it explains of them.
+    """``(E,)`` how far FineNet is believed for each edge's kind, 0 to 1, by the nats that it gains there.
 
-    It has seen the discrepancies that it explains, so that it gains some nats where all edges of a kind err alike.
+    It has seen the discrepancies that it explains, so it gains some nats even if all edges of a kind err alike.
 
     Args:
-        evidence: of the solve.
-        edges: the same, as the noise's scale needs it.
-        used: ``(E,)`` rad², variances without it.
-        log_noise: ``(E,)`` logarithms of what it says over these.
+        evidence: evidence of the solve.
+        edges: the same, as :func:`told` has it.
+        used: ``(E,)`` rad², variances without FineNet.
+        log_noise: ``(E,)`` logarithms of its variances relative to these.
     """
     kind = edges.is_odometry.long()
     variance = used * log_noise.exp()
@@ -114,7 +114,7 @@ def believed(evidence: Evidence, edges: Told, used: Tensor, log_noise: Tensor) -
 
 
 def told(evidence: Evidence, priors: SlamPriors) -> Told:
-    """What others say of edges, and what was believed of their noise."""
+    """Evidence on the noise of edges, with the noise's prior."""
     return Told(
         torch.from_numpy(evidence.is_odometry),
         torch.from_numpy(evidence.is_good.astype(np.float64)),
