@@ -311,7 +311,9 @@ def _with_closures(
 
     places = estimate.places
     if places is not None and laid.position is not None:
-        weight = np.array([1 / linear.noise.closure_turn, 1 / linear.noise.of_closures(0.0)])
+        assert laid.graph.translation is not None
+        known = torch.isfinite(laid.graph.translation[closure]).all(dim=1).numpy()
+        weight = np.stack((np.ones(len(known)) / linear.noise.closure_turn, known / linear.noise.of_closures(0.0)), 1)
         places = replace(
             places,
             position=torch.from_numpy(laid.position),

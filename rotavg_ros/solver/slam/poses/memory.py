@@ -126,8 +126,7 @@ class PoseMemory:
         poses, noise = self.poses, self.noise
         assert graph.translation is not None
         steps = graph.steps.numpy()
-        step = np.nan_to_num(graph.translation[new].numpy())
-        passed = lengths_passed(ways_passed(step), steps[new], self.pose.problem.typical)
+        passed = lengths_passed(ways_passed(graph.translation[new].numpy()), steps[new], self.pose.problem.typical)
         # The way from its anchor to a node turns with the anchor's heading and with the headings of its own steps.
         way = np.linalg.norm(position[self.num_nodes :] - position[growth.anchor], axis=1)
         turned = self.step_variance * growth.along(steps[growth.edge])
@@ -151,11 +150,11 @@ class PoseMemory:
         return replace(self, poses=grown_poses, alone=alone)
 
     def _grown(self, graph: ViewGraph, growth: Growth) -> tuple[torch.Tensor, np.ndarray] | None:
-        """Poses of all nodes, ``(N, 4)`` body_from_world and ``(N, 3)``; None without translations."""
-        if graph.translation is None:
+        """Poses of all nodes, ``(N, 4)`` body_from_world and ``(N, 3)``; None unless the growth has translations."""
+        edge = torch.from_numpy(growth.edge)
+        if graph.translation is None or not bool(torch.isfinite(graph.translation[edge]).all()):
             return None
         orientation = _laid_on(torch.from_numpy(np.ascontiguousarray(self.poses.body_from_world)), growth)
-        edge = torch.from_numpy(growth.edge)
         source = graph.source[edge]
         step = rotations.rotate(rotations.inverse(orientation[source]), graph.translation[edge]).numpy()
         step = np.where((source.numpy() == growth.parent)[:, None], step, -step)

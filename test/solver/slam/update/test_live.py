@@ -226,6 +226,25 @@ def test_what_cannot_be_gone_on_from_is_solved_from_scratch_in_silence_too() -> 
     assert torch.equal(found.body_from_world, cold.body_from_world)
 
 
+def test_between_ticks_what_has_no_translation_moves_no_position() -> None:
+    """New closures without one count with their rotation alone; new odometry without one ends the positions."""
+    full, _ = simulated(translations=True, planar=True)
+    before = until(full, full.num_nodes - 10)
+    solution, graph = solve(before, profile="slam"), until(full, full.num_nodes)
+    assert solution.position is not None and graph.translation is not None
+    is_new = torch.arange(graph.num_edges) >= before.num_edges
+    for edges in (is_new & ~graph.is_odometry, is_new & graph.is_odometry):
+        less = replace(graph, translation=torch.where(edges[:, None], torch.nan, graph.translation))
+        after = go_on(less, solution, work=0.0)
+        if bool((edges & graph.is_odometry).any()):
+            assert after.position is None
+        else:
+            assert after.position is not None and bool(torch.isfinite(after.position).all())
+            assert after.edge_precision is not None and remembered(after).update is not None
+            assert bool((after.edge_precision[edges, 0] > 0).any())
+            assert bool((after.edge_precision[edges, 1] == 0).all())
+
+
 @pytest.mark.large
 @pytest.mark.parametrize("with_places", [False, True])
 def test_a_graph_that_has_lost_keyframes_is_gone_on_from_by_its_labels(with_places: bool) -> None:
