@@ -70,7 +70,7 @@ def agreement_pairs(graph: ClosureGraph) -> AgreementPairs:
 
 def _between_same_chains(pairs: AgreementPairs, graph: ClosureGraph, closure: np.ndarray) -> AgreementPairs:
     """The pairs whose closures connect the same two chains; between others the number of steps is undefined."""
-    chain = graph.paths.chain[graph.nodes]
+    chain = graph.chain
     chains = np.sort(np.stack((chain[graph.source[closure]], chain[graph.target[closure]]), axis=1), axis=1)
     if (chains == chains[0]).all():
         return pairs

@@ -89,6 +89,21 @@ class ClosureGraph:
         return ~self.is_odometry
 
     @property
+    def chain(self) -> np.ndarray:
+        """``(K,)`` the chain of odometry that each key node belongs to, by the chain's lowest end."""
+        return self.paths.chain[self.nodes]
+
+    @property
+    def span(self) -> np.ndarray:
+        """``(2, E)`` positions of each edge's older and newer end."""
+        return np.sort(self.position[np.stack((self.source, self.target))], axis=0)
+
+    def behind(self, segment: int) -> np.ndarray:
+        """``(K,)`` bool, the key nodes that follow a segment along its chain."""
+        chain, newer = self.chain, self.span[1, segment]
+        return np.asarray((chain == chain[self.source[segment]]) & (self.position >= newer))
+
+    @property
     def is_forward(self) -> np.ndarray:
         """``(E,)`` bool, whether edges are stated from the older to the newer end; if equally old, from low to high."""
         older, newer = self.position[self.source], self.position[self.target]

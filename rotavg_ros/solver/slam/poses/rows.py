@@ -303,7 +303,7 @@ class PoseProblem:
     def loose(self) -> np.ndarray:
         """Key nodes at which chains of odometry begin, except chains with a root."""
         drawn = self.drawn
-        chain = drawn.paths.chain[drawn.nodes]
+        chain = drawn.chain
         first = np.unique(chain, return_index=True)[1]
         return np.asarray(first[~np.isin(chain[first], chain[drawn.roots])])
 

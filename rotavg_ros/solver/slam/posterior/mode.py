@@ -98,8 +98,7 @@ class Mode:
         """Edges of odometry that slipped, along the path."""
         graph = self.problem.graph
         edges = np.flatnonzero(graph.is_odometry & ~self.state.is_good)
-        start = np.minimum(graph.position[graph.source[edges]], graph.position[graph.target[edges]])
-        return np.asarray(edges[np.argsort(start, kind="stable")])
+        return np.asarray(edges[np.argsort(graph.span[0, edges], kind="stable")])
 
 
 @dataclass(frozen=True)

@@ -90,9 +90,9 @@ def with_jump(pose: PoseMode, jump: Jump) -> tuple[PoseProblem, PoseStart]:
     If the jump is undone, only what lies in between is displaced.
     """
     problem, state = pose.problem, pose.state
-    shifted = _after(problem, jump.segment)
+    shifted = problem.drawn.behind(jump.segment)
     if jump.back >= 0:
-        shifted &= ~_after(problem, jump.back)
+        shifted &= ~problem.drawn.behind(jump.back)
     ends = [segment for segment in (jump.segment, jump.back) if segment >= 0]
     variance = np.zeros(problem.graph.num_edges) if problem.jump is None else problem.jump.copy()
     variance[problem.longest_steps[ends]] = problem.could_jump[ends]
@@ -124,14 +124,6 @@ def _is_too_far(pose: PoseMode, segments: np.ndarray) -> np.ndarray:
     """``(n,)`` bool: whether segments jump by more than ``_AS_FAR`` times the length of their longest step."""
     square = (_jumped_by(pose, segments) ** 2).sum(axis=1)
     return np.asarray(square > _AS_FAR**2 * pose.problem.could_jump[segments])
-
-
-def _after(problem: PoseProblem, segment: int) -> np.ndarray:
-    """``(K,)`` bool, the key nodes that follow a segment along its chain."""
-    drawn = problem.drawn
-    chain = drawn.paths.chain[drawn.nodes]
-    end = drawn.position[[drawn.source[segment], drawn.target[segment]]].max()
-    return np.asarray((chain == chain[drawn.source[segment]]) & (drawn.position >= end))
 
 
 def _jumped_by(pose: PoseMode, segments: np.ndarray) -> np.ndarray:
@@ -193,7 +185,7 @@ class _Witnesses:
         total = here.spread + own[:, None]
         log_here = here.log_turn - np.log(2 * np.pi * total).sum(axis=1) / 2
         places = solved.places
-        can_tell = told.is_known & (_chain(problem, drawn.source) == _chain(problem, drawn.target))[mode.closure]
+        can_tell = told.is_known & (drawn.chain[drawn.source] == drawn.chain[drawn.target])[mode.closure]
         is_wrong = (places.right < _WRONG) & can_tell & (told.label == 0)
         # A jump that removes a wrong closure's offset gives it at least the density log_here; a right closure that is
         # displaced loses its right place.
@@ -202,7 +194,7 @@ class _Witnesses:
         held = judge(solved.predictions, solved.maps, places.chance, solved.scale, in_order=True).log_density
         freed, lost = log_here - held, -np.log(np.maximum(1 - places.right, _LEAST))
         gain = np.where(can_tell, np.maximum(np.where(is_wrong, freed, lost), 0.0), 0.0)
-        start = np.minimum(drawn.position[drawn.source], drawn.position[drawn.target])[: drawn.num_segments]
+        start = drawn.span[0, : drawn.num_segments]
         order = np.argsort(start, kind="stable")
         first, last = np.searchsorted(start[order], mode.ends.T - _SAME_PLACE)
         last = np.where(can_tell, last, first)
@@ -302,8 +294,3 @@ def _right(chance: np.ndarray, closures: np.ndarray) -> np.ndarray:
     changed = np.where(closures, 0.0, chance)
     changed[0] += closures
     return changed
-
-
-def _chain(problem: PoseProblem, nodes: np.ndarray) -> np.ndarray:
-    drawn = problem.drawn
-    return np.asarray(drawn.paths.chain[drawn.nodes[nodes]])

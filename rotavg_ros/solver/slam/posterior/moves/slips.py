@@ -58,10 +58,9 @@ class Witnesses:
         problem, state, graph, closure = mode.problem, mode.state, mode.problem.graph, mode.problem.closure
         turned = quaternion_rows.residual(state.correction, problem.measured, graph.source, graph.target)[:, closure]
         turned = np.where(problem.sign > 0, turned, quaternion_rows.inverse(turned))
-        chain = graph.paths.chain[graph.nodes]
-        can_tell = chain[graph.source[closure]] == chain[graph.target[closure]]
+        can_tell = graph.chain[graph.source[closure]] == graph.chain[graph.target[closure]]
         segment = np.flatnonzero(state.is_good[: graph.num_segments])
-        start = np.minimum(graph.position[graph.source[segment]], graph.position[graph.target[segment]])
+        start = graph.span[0, segment]
         order = np.argsort(start, kind="stable")
         first, last = np.searchsorted(start[order], problem.ends.T - SAME_PLACE)
         square = (mode.evaluation.residual[closure] ** 2).sum(axis=1)
@@ -200,9 +199,8 @@ def propose_shifts(mode: Mode) -> Iterator[Proposal]:
     """
     graph, limits = mode.problem.graph, mode.problem.limits
     segment = np.flatnonzero(graph.is_odometry[: graph.num_segments])
-    start = np.minimum(graph.position[graph.source[segment]], graph.position[graph.target[segment]])
-    order = segment[np.argsort(start, kind="stable")]
-    chain = graph.paths.chain[graph.nodes[graph.source]]
+    order = segment[np.argsort(graph.span[0, segment], kind="stable")]
+    chain = graph.chain[graph.source]
     before = rough_cost(mode.problem, mode.state)
     slipped = mode.slipped[mode.slipped < graph.num_segments]
     for edge in slipped[: limits.slips]:
@@ -215,14 +213,6 @@ def propose_shifts(mode: Mode) -> Iterator[Proposal]:
                 yield Proposal("shift", predicted, partial(settle, mode.problem, state, SETTLING), limits.rival)
 
 
-def after(mode: Mode, edge: int) -> np.ndarray:
-    """``(K,)`` bool, the key nodes that follow a segment along its chain."""
-    graph = mode.problem.graph
-    chain = graph.paths.chain[graph.nodes]
-    end = max(graph.position[graph.source[edge]], graph.position[graph.target[edge]])
-    return np.asarray((chain == chain[graph.source[edge]]) & (graph.position >= end))
-
-
 def turned_by(mode: Mode, nodes: np.ndarray, turn: np.ndarray) -> State:
     """The mode's state with some key nodes, ``(K,)`` bool, turned by ``turn`` ``(4, 1)``."""
     correction = mode.state.correction.copy()
@@ -230,11 +220,23 @@ def turned_by(mode: Mode, nodes: np.ndarray, turn: np.ndarray) -> State:
     return replace(mode.state, correction=correction)
 
 
+def trusted_after_turn(mode: Mode, state: State, *, may_mend: bool = False) -> np.ndarray:
+    """``(E,)`` labels after a part was turned: closures get the label that their residual favours, odometry keeps its.
+
+    Args:
+        mode: the labelling before.
+        state: the state after the turn.
+        may_mend: whether slips that their residual no longer favours become sound.
+    """
+    odometry, trusted = mode.problem.graph.is_odometry, relabelled(mode.problem, state)
+    kept = mode.state.trusted[odometry]
+    trusted[odometry] = np.maximum(kept, trusted[odometry]) if may_mend else kept
+    return trusted
+
+
 def _with_slip(mode: Mode, edge: int, turn: np.ndarray) -> State:
-    state = turned_by(mode, after(mode, edge), turn)
-    trusted = relabelled(mode.problem, state)
-    odometry = mode.problem.graph.is_odometry
-    trusted[odometry] = mode.state.trusted[odometry]
+    state = turned_by(mode, mode.problem.graph.behind(edge), turn)
+    trusted = trusted_after_turn(mode, state)
     trusted[edge] = 0.0
     return settle(mode.problem, replace(state, trusted=trusted), SETTLING)
 
@@ -250,27 +252,24 @@ def _turn_of(mode: Mode, edge: int) -> np.ndarray:
 
 
 def _shifted(mode: Mode, edge: int, other: int, *, is_later: bool) -> State:
-    turn, follows = _turn_of(mode, edge), after(mode, edge)
+    turn = _turn_of(mode, edge)
+    behind, behind_other = (mode.problem.graph.behind(each) for each in (edge, other))
     if is_later:
-        state = turned_by(mode, follows & ~after(mode, other), turn)
+        state = turned_by(mode, behind & ~behind_other, turn)
     else:
-        state = turned_by(mode, after(mode, other) & ~follows, quaternion_rows.inverse(turn))
-    trusted = relabelled(mode.problem, state)
-    odometry = mode.problem.graph.is_odometry
-    trusted[odometry] = mode.state.trusted[odometry]
+        state = turned_by(mode, behind_other & ~behind, quaternion_rows.inverse(turn))
+    trusted = trusted_after_turn(mode, state)
     trusted[edge], trusted[other] = 1.0, 0.0
     return replace(state, trusted=trusted)
 
 
 def _mended(mode: Mode, edge: int, following: int | None) -> State:
-    graph, turn, nodes = mode.problem.graph, _turn_of(mode, edge), after(mode, edge)
+    graph = mode.problem.graph
+    nodes = graph.behind(edge)
     if following is not None:
-        nodes &= ~after(mode, following)
-    state = turned_by(mode, nodes, turn)
-    trusted = relabelled(mode.problem, state)
-    odometry = graph.is_odometry
-    kept = mode.state.trusted[odometry]
-    trusted[odometry] = np.maximum(kept, trusted[odometry])
+        nodes &= ~graph.behind(following)
+    state = turned_by(mode, nodes, _turn_of(mode, edge))
+    trusted = trusted_after_turn(mode, state, may_mend=True)
     trusted[edge] = 1.0
     return replace(state, trusted=trusted)
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.posterior.em import settle
-from rotavg_ros.solver.slam.posterior.left_out import relabelled, rough_cost
+from rotavg_ros.solver.slam.posterior.left_out import rough_cost
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.moves.slips import (
     LEAST_WITNESSES,
@@ -23,7 +23,7 @@ from rotavg_ros.solver.slam.posterior.moves.slips import (
     SAME_PLACE,
     SETTLING,
     Witnesses,
-    after,
+    trusted_after_turn,
     turned_by,
 )
 from rotavg_ros.solver.slam.posterior.state import State
@@ -89,10 +89,9 @@ def _groups(mode: Mode, witnesses: Witnesses) -> Iterator[_Group]:
 def _parts(mode: Mode, witnesses: Witnesses, groups: list[_Group], slip: int) -> Iterator[_Part]:
     """The part beside a slip with the largest gain, for the turn of each group and for its inverse."""
     graph, ends, segment = mode.problem.graph, mode.problem.ends, witnesses.segment
-    chain = graph.paths.chain[graph.nodes[graph.source]]
-    end = max(graph.position[graph.source[slip]], graph.position[graph.target[slip]]) - SAME_PLACE
-    start = np.minimum(graph.position[graph.source], graph.position[graph.target])[segment]
-    is_later, (older_later, newer_later) = start >= end, (ends >= end).T
+    chain, (older, newer) = graph.chain[graph.source], graph.span
+    end = newer[slip] - SAME_PLACE
+    is_later, (older_later, newer_later) = older[segment] >= end, (ends >= end).T
     across = newer_later & ~older_later
     there = witnesses.can_tell & (chain[mode.problem.closure] == chain[slip])
     good = np.where(there & ~mode.is_false, witnesses.gain, 0.0)
@@ -127,10 +126,8 @@ def _over(witnesses: Witnesses, change: np.ndarray, begin: np.ndarray | None, en
 
 def _split(mode: Mode, part: _Part) -> State:
     """The state with the part turned and its segment slipped; the old slip stays one only if its residual says so."""
-    graph, follows = mode.problem.graph, after(mode, part.slip)
-    state = turned_by(mode, follows ^ after(mode, part.segment), part.turn)
-    trusted = relabelled(mode.problem, state)
-    odometry = graph.is_odometry
-    trusted[odometry] = np.maximum(mode.state.trusted[odometry], trusted[odometry])
+    graph = mode.problem.graph
+    state = turned_by(mode, graph.behind(part.slip) ^ graph.behind(part.segment), part.turn)
+    trusted = trusted_after_turn(mode, state, may_mend=True)
     trusted[part.segment] = 0.0
     return replace(state, trusted=trusted)

@@ -134,7 +134,7 @@ def _joined_chains(problem: Problem) -> Tensor | None:
     are joined along a tree that prefers pairs with many agreeing closures.
     """
     graph, closure = problem.graph, problem.closure
-    _, chain = np.unique(graph.paths.chain[graph.nodes], return_inverse=True)
+    _, chain = np.unique(graph.chain, return_inverse=True)
     ends = np.stack((chain[graph.source[closure]], chain[graph.target[closure]]))
     between = np.flatnonzero(ends[0] != ends[1])
     if len(between) == 0:
