@@ -16,7 +16,7 @@ from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.posterior.inference import Search
 from rotavg_ros.solver.slam.posterior.moves.noise import tuned
-from rotavg_ros.solver.slam.posterior.moves.starts import at, noise_of
+from rotavg_ros.solver.slam.posterior.moves.starts import at, initial_noise
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.publishing.modes import of_mode, publish
 from rotavg_ros.solver.slam.posterior.solve import Drawn, Found, search
@@ -112,7 +112,7 @@ def from_truth(drawn: Drawn, body_from_world: Tensor, is_wrong: Tensor) -> Found
     trusted[slipped] = 0.0
     begun = Search(problem)
     correction = closure_graph.corrections(body_from_world)
-    start = at(problem, correction, trusted, noise_of(problem, drawn.prepared.noise))
+    start = at(problem, correction, trusted, initial_noise(drawn.prepared.noise))
     begun.keep(begun.flipped(begun.polished(start, "truth")))
     for mode in tuned(begun.modes[0]):
         begun.keep(mode)

@@ -57,7 +57,7 @@ def starts(problem: Problem, prepared: Prepared, cleaned: CleanedClosures, tree:
         cleaned: CleanNet's verdict on its closures.
         tree: corrections ``(K, 4)`` along CleanNet's tree, or of an earlier answer.
     """
-    noise = noise_of(problem, prepared.noise)
+    noise = initial_noise(prepared.noise)
     joined = _joined_chains(problem)
     everything = np.ones(len(problem.graph.source))
     yield "tree", settle(problem, at(problem, tree, cleaned.inlier_probability, noise))
@@ -73,7 +73,7 @@ def turned_parts(problem: Problem, prepared: Prepared, tree: Tensor) -> State:
     """A state with parts turned by minimum cuts where odometry seems to have slipped, with labels that then follow."""
     near = noise_between_neighbours(prepared.pairs, problem.components)
     found = _turned_parts(problem, prepared, tree, near)
-    return _labelled(problem, at(problem, found, np.ones(0), noise_of(problem, near)))
+    return _labelled(problem, at(problem, found, np.ones(0), initial_noise(near)))
 
 
 def turned_further(problem: Problem, prepared: Prepared, state: State) -> State:
@@ -86,8 +86,8 @@ def turned_further(problem: Problem, prepared: Prepared, state: State) -> State:
     return _labelled(problem, at(problem, found, np.ones(0), state.noise))
 
 
-def noise_of(problem: Problem, model: NoiseModel) -> Noise:
-    """Initial θ."""
+def initial_noise(model: NoiseModel) -> Noise:
+    """θ to begin with: the model's variances, without stated precisions, common errors, turns or tails."""
     return Noise(model.step_variance, model.closure_variance, EXPONENTS[0], COMMON_SHARES[1], RUN_STEPS[0])
 
 

@@ -14,7 +14,7 @@ from rotavg_ros.solver.slam.posterior.left_out import relabelled
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.moves.runs import propose_rejected_runs
 from rotavg_ros.solver.slam.posterior.moves.splits import propose_splits
-from rotavg_ros.solver.slam.posterior.moves.starts import at, noise_of
+from rotavg_ros.solver.slam.posterior.moves.starts import at, initial_noise
 from rotavg_ros.solver.slam.posterior.solve import Drawn
 from test.solver.graphs import as_quaternions, measured, random_truth, small_noise
 
@@ -47,7 +47,7 @@ def mode_at(drawn: Drawn, body_from_world: Rotation, slipped: list[int]) -> Mode
     """The labelling that orientations speak for, odometry slipping after some nodes alone."""
     graph, problem = drawn.problem.graph, drawn.problem
     correction = drawn.prepared.closure_graph.corrections(as_quaternions(body_from_world))
-    state = at(problem, correction, np.ones(len(graph.source)), noise_of(problem, drawn.prepared.noise))
+    state = at(problem, correction, np.ones(len(graph.source)), initial_noise(drawn.prepared.noise))
     trusted = relabelled(problem, state)
     start = np.minimum(graph.nodes[graph.source], graph.nodes[graph.target])[: graph.num_segments]
     trusted[: graph.num_segments] = 1.0
