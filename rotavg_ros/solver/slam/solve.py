@@ -19,7 +19,7 @@ from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each, without_r
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.calibration import calibrated
 from rotavg_ros.solver.slam.options import SlamStages
-from rotavg_ros.solver.slam.poses.search.jumps import of_jumps
+from rotavg_ros.solver.slam.poses.search.jumps import jump_warnings
 from rotavg_ros.solver.slam.poses.solve import has_places, median_poses
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.publishing.modes import publish
@@ -93,7 +93,7 @@ def _whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     is_divided = bool(published.warnings) if poses is None else poses.poses.is_divided
     # The posterior's warning is about rivals by rotations alone; translations may have decided between them.
     told = estimate.warnings if is_divided else ()
-    jumps = () if poses is None else of_jumps(poses.pose)
+    jumps = () if poses is None else jump_warnings(poses.pose)
     estimate = replace(estimate, warnings=(*told, *notes_of(mode, found.suspected), *jumps))
     if stages == SlamStages():
         memory = SlamMemory.of(graph, found.calibration, mode, estimate, is_divided)

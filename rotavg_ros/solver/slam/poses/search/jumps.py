@@ -133,7 +133,7 @@ def _jumped_by(pose: PoseMode, segments: np.ndarray) -> np.ndarray:
     return np.asarray(way - (position[drawn.target[segments]] - position[drawn.source[segments]]))
 
 
-def of_jumps(pose: PoseMode) -> tuple[str, ...]:
+def jump_warnings(pose: PoseMode) -> tuple[str, ...]:
     """A warning that odometry's position jumped, or none."""
     problem, drawn = pose.problem, pose.problem.drawn
     jumped = np.flatnonzero(problem.jumps)
