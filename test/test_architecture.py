@@ -171,7 +171,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "search": {"closures", "em", "places", "repeats", "rows", "solved"},
         "answer": {"rows", "solved"},
         "memory": {"answer", "closures", "em", "rows", "solved", "state"},
-        "solve": {"answer", "em", "memory", "rows", "search"},
+        "solve": {"answer", "em", "memory", "rows", "search", "solved"},
     },
     "solver/slam/posterior": {
         "": set(),

@@ -39,6 +39,11 @@ _FARTHEST = 1e3
 _GROUNDING = 1e6
 
 
+def crossing(turns: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+    """``(3, m k)`` map from v to the entries of v × in bases ``(3, k)`` and ``(3, m)``: (v × a) · b = v · (a × b)."""
+    return np.asarray(np.cross(turns.T[None], shifts.T[:, None]).reshape(-1, 3).T)
+
+
 @dataclass(frozen=True)
 class PoseProblem:
     """A labelling of a robot's graph, with translations (E edges: S segments first; C closures).
@@ -359,9 +364,7 @@ class PoseProblem:
 
     @cached_property
     def _crossing(self) -> np.ndarray:
-        """``(3, m k)`` map from v to the entries of v × in the bases: (v × a) · b = v · (a × b)."""
-        turns, shifts = self.bases
-        return np.asarray(np.cross(turns.T[None], shifts.T[:, None]).reshape(-1, 3).T)
+        return crossing(*self.bases)
 
     def _crossed(self, vector: np.ndarray) -> np.ndarray:
         """``(E, m, k)`` matrices of v × in the bases."""

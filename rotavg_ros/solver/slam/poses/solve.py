@@ -13,6 +13,7 @@ from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.memory import PoseMemory
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.search.rivals import rival_poses
+from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
 
@@ -51,20 +52,22 @@ def poses_of_update(graph: ViewGraph, mode: Mode, memory: PoseMemory) -> PoseMem
     start = memory.start(graph, problem)
     if start is None:
         return None
-    pose = estimate_poses(problem, start=start)
-    return PoseMemory.of(pose, answer([pose], np.ones(1))[0])
+    return _remembered(estimate_poses(problem, start=start))
 
 
 def poses_of_labels(graph: ViewGraph, mode: Mode) -> PoseMemory:
     """Poses of a calibrated graph, from the labels of its rotations alone."""
-    pose = estimate_poses(PoseProblem(graph, _translations(graph), mode))
-    return PoseMemory.of(pose, answer([pose], np.ones(1))[0])
+    return _remembered(estimate_poses(PoseProblem(graph, _translations(graph), mode)))
 
 
 def poses_of_kept(graph: ViewGraph, mode: Mode, kept: KeptLabels) -> PoseMemory:
     """Poses of a calibrated graph, from the labels of its rotations and the kept classes of its closures' places."""
     problem = PoseProblem(graph, _translations(graph), mode)
-    pose = estimate_poses(problem, start=PoseStart.kept(problem, kept.places, kept.pose_noise))
+    return _remembered(estimate_poses(problem, start=PoseStart.kept(problem, kept.places, kept.pose_noise)))
+
+
+def _remembered(pose: PoseMode) -> PoseMemory:
+    """The memory of a single labelling's poses."""
     return PoseMemory.of(pose, answer([pose], np.ones(1))[0])
 
 

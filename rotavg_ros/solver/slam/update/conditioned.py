@@ -24,6 +24,7 @@ from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.graph.routes import ways_by
 from rotavg_ros.solver.slam.poses.memory import ACROSS, WALK
+from rotavg_ros.solver.slam.poses.rows import crossing
 from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.update.columns import Columns
@@ -240,8 +241,7 @@ class _System:
         """``(n, m, k)`` matrices of v × in the axes of shifts and turns."""
         turns, shifts = self.linear.turns, self.linear.shifts
         assert turns is not None and shifts is not None
-        crossing = np.cross(turns.T[None], shifts.T[:, None]).reshape(-1, 3).T
-        return np.asarray((vector @ crossing).reshape(len(vector), shifts.shape[1], turns.shape[1]))
+        return np.asarray((vector @ crossing(turns, shifts)).reshape(len(vector), shifts.shape[1], turns.shape[1]))
 
     def covariance(self, by_columns: np.ndarray, count: int) -> np.ndarray:
         """``(n, d, n, d)`` S of the first ``count`` closures, given A H⁻¹ Aᵀ ``(n d, n d)``."""

@@ -67,8 +67,7 @@ def _believed_alone(mode: Mode) -> np.ndarray:
 
     Closures whose errors slightly exceed those of good ones agree with each other, so one keeps the other false.
     """
-    is_false = ~mode.state.is_good & mode.problem.graph.is_closure & ~np.isinf(mode.problem.log_odds)
-    return np.flatnonzero(is_false & (mode.left_out.unrepeated > 0))
+    return np.flatnonzero(_may_be_good(mode) & (mode.left_out.unrepeated > 0))
 
 
 def _fitting(mode: Mode) -> np.ndarray:
@@ -76,8 +75,12 @@ def _fitting(mode: Mode) -> np.ndarray:
 
     If nothing else joins two parts, a single closure between them gives no evidence, but all of them together do.
     """
-    is_false = ~mode.state.is_good & mode.problem.graph.is_closure & ~np.isinf(mode.problem.log_odds)
-    return np.flatnonzero(is_false & (relabelled(mode.problem, mode.state) > 0))
+    return np.flatnonzero(_may_be_good(mode) & (relabelled(mode.problem, mode.state) > 0))
+
+
+def _may_be_good(mode: Mode) -> np.ndarray:
+    """``(E,)`` bool, false closures whose label no user has set."""
+    return ~mode.state.is_good & mode.problem.graph.is_closure & ~np.isinf(mode.problem.log_odds)
 
 
 def _polished(mode: Mode, trusted: np.ndarray, solves: int) -> Mode:
