@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-# Grids that replace integrals over α, κ and the length of runs, in steps of odometry; with 0, closures err
-# independently.
+# Grids from which F chooses α, κ and the length of runs, in steps of odometry; with length 0, closures err
+# independently. Alternatives of nearly the same F are averaged when published.
 EXPONENTS = (0.0, 0.5, 1.0)
 COMMON_SHARES = (0.15, 0.3, 0.6, 0.85)
 RUN_STEPS = (0.0, 20.0, 60.0)
