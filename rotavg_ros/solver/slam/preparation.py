@@ -80,7 +80,7 @@ def prepare(graph: ViewGraph) -> Prepared:
 
 def prepare_as_it_is(graph: ViewGraph, components: int | None = None) -> Prepared:
     """The same without removing a bias; ``components`` of the noise: by default, those of the rotations."""
-    closure_graph, forest = draw_together(graph)
+    closure_graph, forest = contract_odometry(graph)
     spend(_CLOSURE * int(closure_graph.is_closure.sum()))
     closure = closure_graph.is_closure
     squared_angle = (rotations.log(closure_graph.residual) ** 2).sum(dim=1).numpy()[closure]
@@ -98,7 +98,7 @@ def likely_bias(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:
     bias, closure_graph, forest, corrected = np.zeros(3), prepared.closure_graph, prepared.forest, graph
     for number in range(_BIAS_ROUNDS):
         if number > 0:
-            closure_graph, forest = draw_together(corrected)
+            closure_graph, forest = contract_odometry(corrected)
         estimate = estimate_bias(corrected, forest, closure_graph, noise)
         if number == 0 and estimate.explained < _BIAS_EXPLAINED * _BIAS_GAIN:
             return None
@@ -115,7 +115,7 @@ def _may_be_biased(prepared: Prepared) -> bool:
     return bool((disagrees & is_confirmed).mean() > _BIAS_CONFIRMED * _BIAS_GAIN)
 
 
-def draw_together(graph: ViewGraph) -> tuple[ClosureGraph, SpanningForest]:
+def contract_odometry(graph: ViewGraph) -> tuple[ClosureGraph, SpanningForest]:
     """The closure graph, and the forest along which it was contracted; rejected edges take no part."""
     spend(_EDGE * graph.num_edges)
     usable = graph.label != EdgeLabel.REJECTED
