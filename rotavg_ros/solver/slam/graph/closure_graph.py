@@ -91,7 +91,7 @@ class ClosureGraph:
     @property
     def chain(self) -> np.ndarray:
         """``(K,)`` the chain of odometry that each key node belongs to, by the chain's lowest end."""
-        return self.paths.chain[self.nodes]
+        return np.asarray(self.paths.chain[self.nodes])
 
     @property
     def span(self) -> np.ndarray:

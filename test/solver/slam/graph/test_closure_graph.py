@@ -60,6 +60,19 @@ def test_path_steps_are_networkxs(num_nodes: int, num_closures: int, seed: int) 
         assert steps == expected
 
 
+@given(st.integers(6, 40), st.integers(0, 8), st.integers(0, 10**6))
+def test_what_lies_behind_a_segment_is_what_its_removal_cuts_off(num_nodes: int, num_closures: int, seed: int) -> None:
+    contracted = _contract(_slam_graph(num_nodes, num_closures, seed))
+    segments = list(zip(contracted.source.tolist(), contracted.target.tolist(), strict=True))[: contracted.num_segments]
+    for segment, ends in enumerate(segments):
+        others = networkx.Graph(segments[:segment] + segments[segment + 1 :])
+        others.add_nodes_from(ends)
+        newer = max(ends, key=lambda end: contracted.position[end])
+        behind = set(np.flatnonzero(contracted.behind(segment)).tolist())
+        assert behind == networkx.node_connected_component(others, newer)
+        assert contracted.span[:, segment].tolist() == sorted(contracted.position[list(ends)])
+
+
 def test_path_steps_are_infinite_where_odometry_does_not_connect() -> None:
     """Two robots, two closures between them."""
     source, target = np.array([0, 1, 3, 4, 0, 2]), np.array([1, 2, 4, 5, 3, 5])

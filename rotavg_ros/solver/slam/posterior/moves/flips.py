@@ -80,7 +80,7 @@ def _fitting(mode: Mode) -> np.ndarray:
 
 def _may_be_good(mode: Mode) -> np.ndarray:
     """``(E,)`` bool, false closures whose label no user has set."""
-    return ~mode.state.is_good & mode.problem.graph.is_closure & ~np.isinf(mode.problem.log_odds)
+    return np.asarray(~mode.state.is_good & mode.problem.graph.is_closure & ~np.isinf(mode.problem.log_odds))
 
 
 def _polished(mode: Mode, trusted: np.ndarray, solves: int) -> Mode:
