@@ -66,16 +66,16 @@ class Jump:
 def likeliest_jump(pose: PoseMode) -> Jump | None:
     """The jump of largest predicted gain; None if none makes at least two closures right."""
     witnesses = _Witnesses.of(pose)
-    speakers: list[int] = []
+    proposers: list[int] = []
     left = witnesses.is_wrong.copy()
-    while left.sum() >= _LEAST_WITNESSES and len(speakers) < _LOOKED_AT:
+    while left.sum() >= _LEAST_WITNESSES and len(proposers) < _LOOKED_AT:
         # The closure of largest gain proposes the next shift; those that agree with it need not propose theirs.
-        speakers.append(int(np.argmax(np.where(left, witnesses.gain, -1.0))))
-        left &= ~witnesses.agreeing(speakers[-1])
-    best = _best([witnesses.jump(pose, speaker, witnesses.place(speaker)) for speaker in speakers])
+        proposers.append(int(np.argmax(np.where(left, witnesses.gain, -1.0))))
+        left &= ~witnesses.agreeing(proposers[-1])
+    best = _best([witnesses.jump(pose, proposer, witnesses.place(proposer)) for proposer in proposers])
     if best is not None and best.gained > 0:
         return best
-    several = [witnesses.jump(pose, speaker, witnesses.stretch(speaker)) for speaker in speakers[:_STRETCHES]]
+    several = [witnesses.jump(pose, proposer, witnesses.stretch(proposer)) for proposer in proposers[:_STRETCHES]]
     return _best([jump for jump in (best, *several) if jump is not None])
 
 
@@ -207,23 +207,23 @@ class _Witnesses:
         spread = np.trace(solved.predictions.covariance[:, k:, k:], axis1=1, axis2=2) / problem.shifts
         return cls(shift, spread + own, is_wrong, gain, first, last, order, np.where(jumps, 0.0, price), variance)
 
-    def agreeing(self, speaker: int, sign: float = 1.0) -> np.ndarray:
+    def agreeing(self, proposer: int, sign: float = 1.0) -> np.ndarray:
         """``(C,)`` bool, wrong closures with the same shift as the proposing one; with ``sign`` -1, the opposite."""
-        square = ((sign * self.shift - self.shift[speaker]) ** 2).sum(axis=1) / self.shift.shape[1]
-        return np.asarray(self.is_wrong & (square < _AGREE**2 * (self.spread + self.spread[speaker])))
+        square = ((sign * self.shift - self.shift[proposer]) ** 2).sum(axis=1) / self.shift.shape[1]
+        return np.asarray(self.is_wrong & (square < _AGREE**2 * (self.spread + self.spread[proposer])))
 
-    def place(self, speaker: int) -> tuple[int, int, float]:
+    def place(self, proposer: int) -> tuple[int, int, float]:
         """Index of the segment where the jump that one closure proposes gains most; -1: not undone; gain in nats."""
         rest()
-        change = self._changed(speaker)
+        change = self._changed(proposer)
         across = np.zeros(len(self.segment) + 1)
         np.add.at(across, self.first, change)
         np.add.at(across, self.last, -change)
-        gained = np.cumsum(across)[:-1] - self._price_of(speaker)
+        gained = np.cumsum(across)[:-1] - self._price_of(proposer)
         best = int(np.argmax(gained))
         return best, -1, float(gained[best])
 
-    def stretch(self, speaker: int) -> tuple[int, int, float]:
+    def stretch(self, proposer: int) -> tuple[int, int, float]:
         """The displaced stretch that gains most: indices of its first and last segment (-1: none), and gain in nats.
 
         Closures into the stretch have the proposed shift, closures out of it the opposite one. Two-dimensional prefix
@@ -234,14 +234,14 @@ class _Witnesses:
         bins = np.minimum(np.arange(count + 1) * _ENDS // max(count, _ENDS), _ENDS)
         older, newer = bins[self.first], bins[self.last]
         # Each bin is represented by its cheapest segment.
-        price_of = self._price_of(speaker)
+        price_of = self._price_of(proposer)
         segment = np.lexsort((price_of, bins[:-1]))
         segment = segment[np.unique(bins[:-1][segment], return_index=True)[1]]
         shape = len(segment) + 1, len(segment) + 1
         told = older != newer
         into, out = np.zeros(shape), np.zeros(shape)
-        np.add.at(into, (older[told], newer[told]), self._changed(speaker)[told])
-        np.add.at(out, (older[told], newer[told]), self._changed(speaker, -1.0)[told])
+        np.add.at(into, (older[told], newer[told]), self._changed(proposer)[told])
+        np.add.at(out, (older[told], newer[told]), self._changed(proposer, -1.0)[told])
         # Segment s lies between places s and s + 1: older ≤ a < newer ≤ b, and a < older ≤ b < newer.
         before = into.cumsum(axis=0).cumsum(axis=1)
         after = out.cumsum(axis=0)
@@ -253,12 +253,12 @@ class _Witnesses:
         back = int(segment[end]) if end < len(segment) else -1
         return int(segment[begin]), back, float(gained[begin, end])
 
-    def _price_of(self, speaker: int) -> np.ndarray:
+    def _price_of(self, proposer: int) -> np.ndarray:
         """``(S,)`` nats, cost of a jump by the shift that one closure proposes.
 
         That closure determines the shift, so the cost includes the ratio of the shift's prior to its posterior width.
         """
-        square, known = float((self.shift[speaker] ** 2).sum()), float(self.spread[speaker])
+        square, known = float((self.shift[proposer] ** 2).sum()), float(self.spread[proposer])
         width = self.shift.shape[1] * np.log1p(self.variance / known) / 2
         off = square / (2 * np.maximum(self.variance, np.finfo(np.float64).tiny))
         # Shortest shift that is compatible with its uncertainty.
@@ -266,15 +266,15 @@ class _Witnesses:
         off[least**2 > _AS_FAR**2 * self.variance] = np.inf
         return np.asarray(np.where(self.price > 0, self.price + off + width, 0.0))
 
-    def _changed(self, speaker: int, sign: float = 1.0) -> np.ndarray:
+    def _changed(self, proposer: int, sign: float = 1.0) -> np.ndarray:
         """``(C,)`` nats: gain of each closure (negative: loss) if it spans the jump that one closure proposes."""
-        return np.asarray(np.where(self.agreeing(speaker, sign), self.gain, np.where(self.is_wrong, 0.0, -self.gain)))
+        return np.asarray(np.where(self.agreeing(proposer, sign), self.gain, np.where(self.is_wrong, 0.0, -self.gain)))
 
-    def jump(self, pose: PoseMode, speaker: int, place: tuple[int, int, float]) -> Jump:
+    def jump(self, pose: PoseMode, proposer: int, place: tuple[int, int, float]) -> Jump:
         """The jump that one closure proposes, at the given place: begin, end and gain."""
         begin, end, gained = place
         newer, older = self._inside(self.last, begin, end), self._inside(self.first, begin, end)
-        into, out = newer & ~older & self.agreeing(speaker), older & ~newer & self.agreeing(speaker, -1.0)
+        into, out = newer & ~older & self.agreeing(proposer), older & ~newer & self.agreeing(proposer, -1.0)
         freed = into | out
         weight = (into.astype(np.float64) - out) / self.spread
         shift = (weight @ self.shift) / max(float(np.abs(weight).sum()), np.finfo(np.float64).tiny)
