@@ -106,7 +106,7 @@ def _clean_net(stages: SlamStages, run: Run) -> SlamCleanNet | None:
 
 
 def _tuning(stages: SlamStages, run: Run) -> Callable[[Mode], Mode]:
-    """The function that sets each edge's noise in a labelling by FineNet, or leaves it as it is."""
+    """The function that sets each edge's noise in a labelling by FineNet, or leaves the labelling unchanged."""
     if "fine-net" in stages.without:
         return lambda mode: mode
     return partial(fine_tuned, network=run.networks.load(SlamFineNet))

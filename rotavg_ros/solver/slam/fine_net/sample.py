@@ -66,7 +66,7 @@ class FineSample:
 
     Attributes:
         features: the network's input.
-        told: what others say of each edge.
+        told: the prediction of each edge by all others.
         system: rows of the sparse solve.
         residual: ``(E + R, 3)`` rad.
         used: ``(E,)`` rad², inverse weights of edges as good ones.

@@ -2,9 +2,9 @@
 
 A bias β turns every step of the odometry a little further, ``M̃ = M exp(β)`` with β in the body's frame. Along a chain
 the errors ``R_k⁻¹ β`` add up in the world's frame to a rotation vector that is linear in β. So a closure's residual
-against the odometry is linear in β too, as long as it is small. Each closure proposes a bias. The one that most
-closures agree with is refined by expectation–maximisation, taken out of the odometry, and estimated again for the
-better chain.
+against the odometry is linear in β too, as long as it is small. The closures that span the least odometry propose a
+bias each. The likeliest of these is refined by expectation–maximisation, removed from the odometry, and estimated again
+for the better chain.
 """
 
 from __future__ import annotations

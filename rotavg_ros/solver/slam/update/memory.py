@@ -202,7 +202,7 @@ class SlamMemory:
     def thinned_to(self, graph: ViewGraph) -> SlamMemory | None:
         """The memory for a graph that has lost keyframes, as input of :meth:`updated`; None if that is impossible.
 
-        It is impossible if odometry slipped or jumped: where, is no longer known once steps have been merged.
+        It is impossible if odometry slipped or jumped: once steps are merged, it is no longer known at which of them.
         """
         odometry = self.graph.is_odometry.numpy()
         if graph.num_nodes >= self.graph.num_nodes:

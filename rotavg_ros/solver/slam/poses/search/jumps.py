@@ -198,6 +198,7 @@ class _Witnesses:
         order = np.argsort(start, kind="stable")
         first, last = np.searchsorted(start[order], mode.ends.T - _SAME_PLACE)
         last = np.where(can_tell, last, first)
+        # A jump has the same prior in every segment, so segment 0 stands for the next one.
         another = np.append(np.flatnonzero(problem.jumps), 0)
         price = log_jump_prior(problem) - log_slip_prior(mode, another)
         price += float(np.log(np.maximum(drawn.own_steps[another], 1.0)).sum())
@@ -224,7 +225,7 @@ class _Witnesses:
         return best, -1, float(gained[best])
 
     def stretch(self, proposer: int) -> tuple[int, int, float]:
-        """The displaced stretch that gains most: indices of its first and last segment (-1: none), and gain in nats.
+        """The displaced stretch that gains most: indices of the segments that jump and jump back, and gain in nats.
 
         Closures into the stretch have the proposed shift, closures out of it the opposite one. Two-dimensional prefix
         sums over the closures' ends give the gain of all begins and ends at once.

@@ -48,7 +48,7 @@ class TruncatedCost:
     Attributes:
         graph: the closure graph.
         variance: ``(E,)`` rad² per component.
-        cap: ``(E,)`` what a wrong edge costs, ≥ 0.
+        cap: ``(E,)`` cost of a wrong edge, ≥ 0.
         measured: ``(4, E)``, the graph's residuals, components in rows.
         cap_of_two: ``(E,)`` cost of an edge that is wrong by more than one slip.
         uneven_cost: ``(E,)`` prior cost of a segment that drifts more than by its length; inf for closures.
