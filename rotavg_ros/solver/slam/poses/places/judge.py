@@ -153,14 +153,14 @@ class Judge:
     def _log_repeats(
         self, again: _Others, repeats: Repeats, log_alone: np.ndarray, wrong: np.ndarray, in_turn: InTurn
     ) -> tuple[np.ndarray, np.ndarray]:
-        """``(C,)`` nats each: that a wrong place is no neighbour's; and that it is, with the density given by it."""
+        """``(C,)`` nats each: that a wrong place repeats no neighbour's; that it does, plus its log density then."""
         share = again.share(self.priors.repeats * self.priors.counted, (log_alone, wrong), in_turn, self.priors)
         return _log(1 - share * repeats.has_any), _log(share * again.density)
 
     def _log_elsewhere(
         self, anywhere: _Others, log_alone: np.ndarray, wrong: np.ndarray, in_turn: InTurn
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The same of all that are anywhere."""
+        """The same for repeating any closure, wherever it is."""
         share = anywhere.share(self.priors.elsewhere * self.priors.counted, (log_alone, wrong), in_turn, self.priors)
         return _log(1 - share * anywhere.has_any), _log(share * anywhere.density)
 
