@@ -42,7 +42,7 @@ _FLAGGED = 0.5
 _GOOD = 0.5
 
 
-class SearchedOn(NamedTuple):
+class UpdateResult(NamedTuple):
     """Result of an update: the answer, and the labelling."""
 
     estimate: Estimate
@@ -122,7 +122,7 @@ class SlamMemory:
         networks: tuple[SlamCleanNet, SlamFineNet],
         body_from_world: Tensor,
         contradicting: np.ndarray,
-    ) -> SearchedOn:
+    ) -> UpdateResult:
         """Solve a graph, of which only the labels of an earlier solve are left.
 
         Args:
@@ -146,7 +146,7 @@ class SlamMemory:
         search = searched, bool(is_divided), unexplained
         notes = notes_of(found.mode)
         memory = cls(graph, found.trusted, found.noise, found.mode, calibration, *told, *search, notes)
-        return SearchedOn(replace(estimate, memory=memory), found.mode)
+        return UpdateResult(replace(estimate, memory=memory), found.mode)
 
     @property
     def labels(self) -> KeptLabels | None:
@@ -221,7 +221,7 @@ class SlamMemory:
 
     def updated(
         self, graph: ViewGraph, networks: tuple[SlamCleanNet, SlamFineNet], body_from_world: Tensor
-    ) -> SearchedOn:
+    ) -> UpdateResult:
         """Solve a graph that has grown from this one.
 
         Args:
@@ -242,7 +242,7 @@ class SlamMemory:
             outlier_score=estimate.outlier_score,
             variance=estimate.variance,
         )
-        return SearchedOn(replace(estimate, memory=memory), found.mode)
+        return UpdateResult(replace(estimate, memory=memory), found.mode)
 
     def along_odometry(self, graph: ViewGraph, new: Growth) -> Estimate | None:
         """The answer of a graph that has grown by odometry alone; None if the graph has no translations any more.
