@@ -23,12 +23,14 @@ from rotavg_ros.solver.neurora.scores import residual_and_uncertainty, residual_
 from rotavg_ros.solver.neurora.stages import apply_labels, clean, fine_tune, trust_all
 from rotavg_ros.solver.neurora.tiled.tuning import tune
 from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap, breadth_first
+from rotavg_ros.solver.sfm.certainty.attachment import PRIORS as ATTACHMENT
 from rotavg_ros.solver.sfm.certainty.attachment import Attachment, ErrorDensity
 from rotavg_ros.solver.sfm.certainty.uncertainty import References, noise_variance, variances
 from rotavg_ros.solver.sfm.consensus.search import CONSENSUS, consensus
 from rotavg_ros.solver.sfm.cycles.evidence import with_triangles
 from rotavg_ros.solver.sfm.options import SfmStages
-from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
+from rotavg_ros.solver.sfm.priors import RefinementPriors
+from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine, settle
 from rotavg_ros.solver.sfm.series import EdgesInSeries
 from rotavg_ros.solver.sfm.starts.choice import Start, begin, settle_best
 from rotavg_ros.solver.sfm.starts.others import other_starts
@@ -92,11 +94,10 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     if steps > 0 or by_residuals:
         # A tree alone leaves no residuals to judge by. Now a residual is the edge's noise, up to the orientations'
         # error. With the paper's CleanNet, its own scores stand unless the orientations are refined.
-        angle, score = _scored(cleared, answer)
+        angle, score, attached = answer.scored or _scored(cleared, answer)
         if steps > 0:
             with watch.stage("uncertainty"):
                 to = References(component, form.first_nodes())
-                attached = _attached(cleared, answer, angle, score)
                 if attached is not None:
                     score = torch.from_numpy(attached.scores(score.cpu().numpy())).to(score)
                 stated = variances(graph, angle, score, cleared.structure.series.bridge, to)
@@ -126,6 +127,20 @@ class _Cleared(NamedTuple):
     structure: Structure
 
 
+class _Scored(NamedTuple):
+    """What follows from an answer.
+
+    Attributes:
+        angle: ``(M,)`` rad, residuals.
+        score: ``(M,)`` probability that an edge is false, from its residual.
+        attached: how surely parts that few edges join are attached; None: not known.
+    """
+
+    angle: Tensor
+    score: Tensor
+    attached: Attachment | None
+
+
 class _Answer(NamedTuple):
     """An answer.
 
@@ -134,12 +149,14 @@ class _Answer(NamedTuple):
         residual: ``(M,)`` rad, if known.
         warnings: one sentence each.
         parts: parts of the graph that few edges join, if it was searched for any.
+        scored: what follows from it, if known.
     """
 
     body_from_world: Tensor
     residual: Tensor | None = None
     warnings: tuple[str, ...] = ()
     parts: Parts | None = None
+    scored: _Scored | None = None
 
 
 def _refined(cleared: _Cleared, orientations: Tensor, stages: SfmStages, steps: int, watch: Stopwatch) -> _Answer:
@@ -165,41 +182,62 @@ def _refined(cleared: _Cleared, orientations: Tensor, stages: SfmStages, steps: 
             orientations, weights = noise.refined(orientations, weights, refinement)
         doubtful = 0 if best.is_doubtful is None else int(best.is_doubtful.sum())
         warnings = (_NEARLY_AS_GOOD.format(doubtful, len(component)),) if doubtful else ()
-    if not stages.consensus:
-        return _Answer(orientations, None, warnings, begun.parts)
-    with watch.stage("consensus"):
-        residual = EdgeResiduals(graph, orientations.float()).angles()
-        other = consensus(graph, orientations, component, CONSENSUS, residual)
-        if other is None:
-            return _Answer(orientations, residual, warnings, begun.parts)
-        if other.body_from_world is None or other.weight is None:
-            return _Answer(orientations, residual, warnings + other.warnings, begun.parts)
-        weights = weights.times(other.weight, other.weight)
-        return _Answer(refinement(other.body_from_world, weights=weights), None, other.warnings, begun.parts)
+    answer = _Answer(orientations, None, warnings, begun.parts)
+    if stages.consensus:
+        with watch.stage("consensus"):
+            residual = EdgeResiduals(graph, orientations.float()).angles()
+            answer = answer._replace(residual=residual)
+            other = consensus(graph, orientations, component, CONSENSUS, residual)
+            if other is not None:
+                answer = answer._replace(warnings=warnings + other.warnings)
+                if other.body_from_world is not None and other.weight is not None:
+                    weights = weights.times(other.weight, other.weight)
+                    orientations = refinement(other.body_from_world, weights=weights)
+                    answer = _Answer(orientations, None, other.warnings, begun.parts)
+    if answer.parts is None:
+        return answer
+    with watch.stage("attach"):
+        return _reattached(cleared, answer, weights, priors)
 
 
-def _scored(cleared: _Cleared, answer: _Answer) -> tuple[Tensor, Tensor]:
-    """Residuals ``(M,)`` rad of an answer, and the outlier probabilities ``(M,)`` that follow from them."""
+def _reattached(cleared: _Cleared, answer: _Answer, weights: EdgeWeights, priors: RefinementPriors) -> _Answer:
+    """The answer after parts are turned that few edges join, and that are likelier elsewhere."""
+    graph, structure = cleared.judged.measured, cleared.structure
+    for _ in range(ATTACHMENT.rounds):
+        scored, orientations = _scored(cleared, answer), answer.body_from_world
+        turned = None if scored.attached is None else scored.attached.likelier(_rows(orientations))
+        if turned is None:
+            return answer._replace(scored=scored)
+        start = torch.from_numpy(np.ascontiguousarray(turned.T)).to(orientations)
+        # Components are answered as if each were alone.
+        is_turned = torch.zeros_like(structure.roots).index_add_(
+            0, structure.component, (start != orientations).any(dim=1).long()
+        )
+        refined = settle(graph, start, weights, structure, priors).body_from_world
+        orientations = torch.where((is_turned > 0)[structure.component][:, None], refined, orientations)
+        answer = answer._replace(body_from_world=orientations, residual=None)
+    return answer
+
+
+def _scored(cleared: _Cleared, answer: _Answer) -> _Scored:
     graph, structure = cleared.judged.measured, cleared.structure
     series, component = structure.series, structure.component
     angle, spread = residual_and_uncertainty(graph, answer.body_from_world, component, answer.residual)
     score = residual_probability(angle, spread, NUMBERS.outlier_angle)
     score[series.edge] = series.score(angle[series.edge], spread[series.edge], NUMBERS.outlier_angle)
-    score[series.bridge] = series.bridge_score(score, component[graph.source], len(structure.roots))
-    return angle, score
-
-
-def _attached(cleared: _Cleared, answer: _Answer, angle: Tensor, score: Tensor) -> Attachment | None:
-    """How surely parts that few edges join are attached, given residuals and scores ``(M,)``; None: unknown."""
-    if answer.parts is None:
-        return None
-    graph, structure = cleared.judged.measured, cleared.structure
-    component = structure.component
     of_edge = component[graph.source]
-    share = structure.series.false_share(score, of_edge, len(structure.roots))
+    score[series.bridge] = series.bridge_score(score, of_edge, len(structure.roots))
+    if answer.parts is None:
+        return _Scored(angle, score, None)
+    share = series.false_share(score, of_edge, len(structure.roots))
     noise = noise_variance(graph, angle, score, component)[structure.roots].sqrt()
     density = ErrorDensity.of(*(one.cpu().numpy() for one in (angle.double(), score, of_edge, share, noise)))
-    return Attachment.of(answer.parts, np.ascontiguousarray(answer.body_from_world.cpu().double().numpy().T), density)
+    return _Scored(angle, score, Attachment.of(answer.parts, _rows(answer.body_from_world), density))
+
+
+def _rows(body_from_world: Tensor) -> np.ndarray:
+    """Orientations ``(N, 4)`` → ``(4, N)``, in memory as well."""
+    return np.ascontiguousarray(body_from_world.cpu().double().numpy().T)
 
 
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:

@@ -25,7 +25,7 @@ from rotavg_ros.solver.algebra.pointer_jumping import lowest_common_ancestors
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.priors import AttachmentPriors
-from rotavg_ros.solver.sfm.starts.parts import Parts
+from rotavg_ros.solver.sfm.starts.parts import Parts, Turns
 
 PRIORS = AttachmentPriors()
 # Edges that only check each other in pairs have scores of their own (``series.py``).
@@ -92,6 +92,8 @@ class Attachment:
         variance: ``(K,)`` rad², expected square of each component of its turn.
         elsewhere: ``(P,)`` expected probability that the edge is good if the part is turned, times the probability that
             it is.
+        turns: the likeliest other turn of each part. Its change is negative if it is likelier than the answer, and than
+            that all edges are false, by ``AttachmentPriors.ahead``.
     """
 
     parts: Parts
@@ -99,6 +101,7 @@ class Attachment:
     is_right: np.ndarray
     variance: np.ndarray
     elsewhere: np.ndarray
+    turns: Turns
 
     @classmethod
     def of(cls, parts: Parts, body_from_world: np.ndarray, density: ErrorDensity) -> Attachment:
@@ -107,17 +110,18 @@ class Attachment:
         component = parts.forest.component[node]
         stated = parts.stated(body_from_world)
         angle = rows.angle(stated[3])
-
         here = _Peaks.of(density, angle, part, component).log_mass
         none = np.bincount(part, minlength=len(node)) * np.log(density.false_share[component])
         tries = np.flatnonzero(angle > NUMBERS.outlier_angle)
         found: list[tuple[_Peaks, np.ndarray, np.ndarray, np.ndarray]] = []
-        most = np.maximum(here, none)
+        present = np.maximum(here, none)
+        most = present.copy()
         for one, which, other in parts.pairs(tries):
             between = rows.angle(np.einsum("ip,ip->p", stated[:, one[which]], stated[:, other]))
             peaks = _Peaks.of(density, between, which, component[part[one]])
             np.maximum.at(most, part[one], peaks.log_mass)
             found.append((peaks, one, which, other))
+        turns = _likeliest(node, part, stated, present, found)
         here, none = np.exp(here - most), np.exp(none - most)
         total, variance, elsewhere = here + none, none * rotations.RANDOM_VARIANCE, np.zeros(len(part))
         for peaks, one, which, other in found:
@@ -126,7 +130,14 @@ class Attachment:
             total += np.bincount(part[one], mass, len(node))
             variance += np.bincount(part[one], mass * angle[one] ** 2 / 3, len(node))
             elsewhere += np.bincount(other, mass[which] * peaks.good, len(part))
-        return cls(parts, part, here / total, variance / total, elsewhere / total[part])
+        return cls(parts, part, here / total, variance / total, elsewhere / total[part], turns)
+
+    def likelier(self, body_from_world: np.ndarray) -> np.ndarray | None:
+        """The answer ``(4, N)`` with parts turned that are likelier elsewhere; None if none is by enough."""
+        chosen = self.parts.gaining(self.turns)
+        # Two edges leave the turn open, and the misfit is spread between them.
+        chosen &= np.bincount(self.part, minlength=len(chosen)) >= _SEVERAL
+        return self.parts.turned(body_from_world, self.turns, chosen) if chosen.any() else None
 
     def scores(self, score: np.ndarray) -> np.ndarray:
         """Probabilities ``(M,)`` that edges are false, given those under the answer as it is."""
@@ -152,6 +163,25 @@ class Attachment:
         meeting = lowest_common_ancestors(forest.parent, level, np.arange(len(own)), reference)
         between = total + total[reference] - 2 * total[meeting]
         return np.asarray(np.minimum(between, rotations.RANDOM_VARIANCE))
+
+
+def _likeliest(
+    node: np.ndarray,
+    part: np.ndarray,
+    stated: np.ndarray,
+    present: np.ndarray,
+    found: list[tuple[_Peaks, np.ndarray, np.ndarray, np.ndarray]],
+) -> Turns:
+    """The turn ``(4, P)`` of most mass for each part ``(K,)``, against the ``present`` logarithm of a mass ``(K,)``."""
+    change, turn = np.full(len(node), np.inf), np.tile(np.array([[0.0], [0.0], [0.0], [1.0]]), len(node))
+    tries = np.concatenate([one for _, one, *_ in found])
+    mass = np.concatenate([peaks.log_mass for peaks, *_ in found])
+    order = np.lexsort((tries, -mass, part[tries]))
+    at, first = np.unique(part[tries[order]], return_index=True)
+    chosen = order[first]
+    change[at] = present[at] + PRIORS.ahead - mass[chosen]
+    turn[:, at] = stated[:, tries[chosen]]
+    return Turns(node, change, turn)
 
 
 class _Peaks(NamedTuple):

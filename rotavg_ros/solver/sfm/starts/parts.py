@@ -36,7 +36,7 @@ class Turns:
 
     Attributes:
         node: ``(K,)`` the branches' topmost nodes.
-        change: ``(K,)`` change of Σ w ‖r‖^½ if this branch alone is turned; infinite if no edge states a far turn.
+        change: ``(K,)`` change of the cost if this branch alone is turned; infinite if no edge states a far turn.
         turn: ``(4, K)`` in the world's frame: orientations become body_from_world · turn.
     """
 
@@ -130,14 +130,16 @@ class Parts:
             turns = self.turns(body_from_world)
             if not bool((turns.change < 0).any()):
                 break
-            # Of branches that the same edge joins, the one is turned that gains most.
-            branch = np.searchsorted(turns.node, self.node)
-            of_edge, of_branch = np.full(len(self.source), np.inf), np.full(len(turns.node), np.inf)
-            np.minimum.at(of_edge, self.edge, turns.change[branch])
-            np.minimum.at(of_branch, branch, of_edge[self.edge])
-            chosen = (turns.change < 0) & (turns.change <= of_branch)
-            body_from_world, is_turned = self.turned(body_from_world, turns, chosen), True
+            body_from_world, is_turned = self.turned(body_from_world, turns, self.gaining(turns)), True
         return body_from_world if is_turned else None
+
+    def gaining(self, turns: Turns) -> np.ndarray:
+        """Branches ``(K,)`` whose turns are a gain; of branches that the same edge joins, the one that gains most."""
+        branch = np.searchsorted(turns.node, self.node)
+        of_edge, of_branch = np.full(len(self.source), np.inf), np.full(len(turns.node), np.inf)
+        np.minimum.at(of_edge, self.edge, turns.change[branch])
+        np.minimum.at(of_branch, branch, of_edge[self.edge])
+        return np.asarray((turns.change < 0) & (turns.change <= of_branch))
 
     def rival(self, body_from_world: np.ndarray, priors: RefinementPriors) -> np.ndarray | None:
         """The orientations with a turn, in each component, that raises the cost least; None if all raise it by much.
