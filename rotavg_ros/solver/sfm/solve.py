@@ -104,7 +104,8 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
                 if stated is not None and attached is not None:
                     turned = attached.variances(to.node[component].cpu().numpy())
                     stated = stated + torch.from_numpy(turned).to(stated)
-            variance = variance if stated is None else form.of_nodes(stated)
+            if stated is not None:
+                variance = form.of_nodes(stated.clamp(max=rotations.RANDOM_VARIANCE))
     score = score.index_select(0, form.edge)
     return Estimate(form.orientations(answer.body_from_world), score, variance, warnings=answer.warnings)
 
