@@ -259,6 +259,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "planar": set(),
         "worlds": set(),
         "files": {"dead_reckoning", "planar"},
+        "interpolation": {"files"},
         "simulation": {"files", "worlds"},
     },
 }

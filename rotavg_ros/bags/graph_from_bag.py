@@ -26,6 +26,7 @@ from rotavg_ros.bags.topics import (
     static_transforms,
 )
 from rotavg_ros.datasets.files.graph_file import MAX_NODE_ID, GraphFile
+from rotavg_ros.datasets.interpolation import poses_at
 from rotavg_ros.datasets.planar import are_about_z, are_level
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, ViewGraphError, where_possible
 
@@ -209,10 +210,12 @@ def _counted(skipped: dict[str, int]) -> dict[str, int]:
     return {what: count for what, count in skipped.items() if count}
 
 
+def _is_oriented(message: _Pose) -> bool:
+    return abs(float(np.linalg.norm(message[2])) - 1) <= UNIT_NORM_TOLERANCE
+
+
 def _is_sound(message: _Pose) -> bool:
-    _, position, orientation = message
-    off = abs(float(np.linalg.norm(orientation)) - 1)
-    return off <= UNIT_NORM_TOLERANCE and bool(np.isfinite(position).all())
+    return _is_oriented(message) and bool(np.isfinite(message[1]).all())
 
 
 def _translations(edges: Sequence[Edge]) -> NDArray[np.float64]:
@@ -235,7 +238,11 @@ def _nearest(stamps_ns: NDArray[np.int64], end: Keyframe) -> int:
 
 
 def _with_truth(graph_file: GraphFile, content: _Content) -> GraphFile:
-    """Add ground truth to the nodes of the same stamps; drop stamps that were only made up for the bag."""
+    """Add ground truth to the nodes; drop stamps that were only made up for the bag.
+
+    A node has the truth of its own stamp, or, unless the bag was made of a graph whose truth has gaps, that between the
+    stamps around it.
+    """
     if graph_file.stamps_ns is None:
         return graph_file
     nodes_at: dict[int, list[int]] = {}
@@ -247,9 +254,11 @@ def _with_truth(graph_file: GraphFile, content: _Content) -> GraphFile:
         if nodes := nodes_at.get(stamp):
             node = nodes.pop(0) if len(nodes) > 1 else nodes[0]
             position[node] = true_position
-            if abs(float(np.linalg.norm(true_orientation)) - 1) <= UNIT_NORM_TOLERANCE:
+            if _is_oriented((stamp, true_position, true_orientation)):
                 orientation[node] = np.array(true_orientation) * _CONJUGATE
     if content.truth:
+        if not content.note:
+            _fill(graph_file.stamps_ns, [pose for pose in content.truth if _is_oriented(pose)], position, orientation)
         if np.isfinite(orientation).any():
             graph_file = replace(graph_file, body_from_world_gt=orientation)
         if content.note.get("position_gt", True):
@@ -257,3 +266,21 @@ def _with_truth(graph_file: GraphFile, content: _Content) -> GraphFile:
     if not content.note.get("stamps", True):
         graph_file = replace(graph_file, stamps_ns=None)
     return graph_file
+
+
+def _fill(
+    stamps_ns: NDArray[np.int64],
+    truth: list[_Pose],
+    position: NDArray[np.float64],
+    orientation: NDArray[np.float64],
+) -> None:
+    """Write into the rows of both that are unknown what lies between true poses."""
+    unknown = np.isnan(orientation).any(axis=1) & np.isnan(position).any(axis=1)
+    world_from_body, places = poses_at(
+        stamps_ns[unknown],
+        np.array([stamp for stamp, _, _ in truth], dtype=np.int64),
+        np.array([rotation for _, _, rotation in truth]).reshape(-1, 4),
+        np.array([place for _, place, _ in truth]).reshape(-1, 3),
+    )
+    assert places is not None
+    position[unknown], orientation[unknown] = places, world_from_body * _CONJUGATE

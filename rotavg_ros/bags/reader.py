@@ -24,6 +24,7 @@ from rotavg_ros.errors import UserError, asking_about
 
 # Suffixes of files that can be bags by themselves.
 RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
+COMPRESSED_SUFFIX = ".zstd"  # of a recording that rosbag2 has compressed as a whole
 _METADATA = "metadata.yaml"
 
 
@@ -313,9 +314,14 @@ def _bag_of(path: Path, salvage: bool) -> Path:
         has_metadata = ((path if is_folder else path.parent) / _METADATA).exists()
     if not exists:
         raise BagReadError(f"{path}: no such bag; check the path")
-    if not is_folder and path.suffix not in RECORDING_SUFFIXES:
-        raise BagReadError(f"{path}: give a rosbag2 folder, or a file with suffix {', '.join(RECORDING_SUFFIXES)}")
     listed = _listed(path if is_folder else path.parent) if has_metadata else []
+    if not is_folder and path.suffix == COMPRESSED_SUFFIX and path.name not in listed:
+        raise BagReadError(
+            f"{path}: a compressed recording is read only in its folder, beside the {_METADATA} that lists it; unpack "
+            f"it by `unzstd {shlex.quote(str(path))}`"
+        )
+    if not is_folder and path.suffix not in (*RECORDING_SUFFIXES, COMPRESSED_SUFFIX):
+        raise BagReadError(f"{path}: give a rosbag2 folder, or a file with suffix {', '.join(RECORDING_SUFFIXES)}")
     bag = path.parent if path.name in listed else path
     with asking_about(path, BagReadError):
         if is_folder and not listed:

@@ -9,6 +9,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 from rotavg_ros.bags import graph_bag
+from rotavg_ros.bags.reader import COMPRESSED_SUFFIX, RECORDING_SUFFIXES
 from rotavg_ros.cli.main import print_warning
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files import formats
@@ -35,7 +36,7 @@ class Format(NamedTuple):
 
 # The last one also gets unknown suffixes: it recognises formats by content, and explains what it cannot read.
 FORMATS = (
-    Format(("", ".mcap", ".db3", ".bag"), is_folder=True, module=graph_bag),
+    Format(("", *RECORDING_SUFFIXES, COMPRESSED_SUFFIX), is_folder=True, module=graph_bag),
     Format(
         (".g2o", ".graph", ".toro", ".isam", ".npz", ".txt"),
         is_folder=False,
@@ -84,7 +85,7 @@ def _check_output(inputs: Sequence[Path], output: Path, *, overwrite: bool) -> N
         if is_inside:
             raise ConvertError(f"{output}: would be replaced, and {path} is in it; choose another OUTPUT")
     bags, files = FORMATS
-    suffix = output.suffix.lower()
+    suffix = _suffix_of(output)
     if suffix and suffix in bags.suffixes and not is_folder:
         raise ConvertError(f"{output}: a bag is written as a folder; choose an OUTPUT without {output.suffix}")
     if suffix in files.suffixes and is_folder:
@@ -100,5 +101,11 @@ def format_of(path: Path) -> ModuleType:
     elif is_file and not path.suffix:
         chosen = FORMATS[-1]
     else:
-        chosen = next((known for known in FORMATS if path.suffix.lower() in known.suffixes), FORMATS[-1])
+        chosen = next((known for known in FORMATS if _suffix_of(path) in known.suffixes), FORMATS[-1])
     return chosen.module
+
+
+def _suffix_of(path: Path) -> str:
+    """In lower case; empty for a number, as of a date (``run.2024``) or a version, which names no format."""
+    suffix = path.suffix.lower()
+    return "" if suffix[1:].isdecimal() else suffix

@@ -73,7 +73,7 @@ def _check_inputs(bag: Path, plan: Plan, output: Path) -> None:
 
 def _replay(bag: BagReader, plan: Plan, window: Window, arguments: argparse.Namespace) -> dict[str, Any]:
     # The solver and the plots take seconds to import, so they are imported only when needed.
-    from rotavg_ros.replay.assemble import assemble
+    from rotavg_ros.replay.assemble import assemble, check_references
     from rotavg_ros.replay.outputs import RECORDING, output_folder, write_summary, write_tables
     from rotavg_ros.replay.run import Onlooker, replay
     from rotavg_ros.reports import write_report
@@ -82,6 +82,7 @@ def _replay(bag: BagReader, plan: Plan, window: Window, arguments: argparse.Name
     period_ns = round(1e9 * seconds / arguments.answers) if arguments.answers else 0
     with output_folder(arguments.output, overwrite=arguments.overwrite) as (folder, replaces):
         with _asked_to_stop(not replaces) as stop, seconds_bar("replaying", seconds) as progress:
+            check_references(bag, plan, window)
             outcome = replay(bag, plan, window, folder / RECORDING, period_ns, Onlooker(progress, stop))
         with working("writing the report"):
             record = assemble(bag, plan, outcome)

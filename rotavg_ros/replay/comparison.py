@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
-from rotavg_ros.datasets.files.ground_truth import MAX_TRUTH_DISTANCE_NS
+from rotavg_ros.datasets.interpolation import poses_at
 from rotavg_ros.metrics import body_from_world, gauge_alignment, known_rows, orientation_errors, position_errors
 from rotavg_ros.replay.record import Reference, RobotRecord
 
@@ -44,32 +44,7 @@ class OrientationErrors:
 
 def truth_at_keyframes(reference: Reference, stamp_ns: NDArray[np.int64]) -> Truth:
     """The reference between its two samples around each stamp, both at most 0.15 s away (at the ends: one)."""
-    order = np.argsort(reference.stamp_ns, kind="stable")
-    stamps, first = np.unique(reference.stamp_ns[order], return_index=True)
-    order = order[first]
-    count = len(stamp_ns)
-    orientation = np.full((count, 4), np.nan)
-    position = None if reference.position is None else np.full((count, 3), np.nan)
-    if len(stamps) == 0:
-        return Truth(orientation, position)
-    after = np.searchsorted(stamps, stamp_ns).clip(0, len(stamps) - 1)
-    before = np.where(stamps[after] > stamp_ns, np.maximum(after - 1, 0), after)
-    known = (np.abs(stamps[before] - stamp_ns) <= MAX_TRUTH_DISTANCE_NS) & (
-        np.abs(stamps[after] - stamp_ns) <= MAX_TRUTH_DISTANCE_NS
-    )
-    # Seconds since the first sample: nanoseconds since 1970 do not fit into a float.
-    seconds = (stamps - stamps[0]) / 1e9
-    at = ((stamp_ns[known] - stamps[0]) / 1e9).clip(0, seconds[-1])
-    if known.any():
-        samples = reference.world_from_body[order]
-        if len(stamps) == 1:
-            orientation[known] = samples
-        else:
-            orientation[known] = Slerp(seconds, Rotation.from_quat(samples))(at).as_quat(canonical=True)
-        if position is not None and reference.position is not None:
-            ordered = reference.position[order]
-            position[known] = np.stack([np.interp(at, seconds, ordered[:, axis]) for axis in range(3)], axis=1)
-    return Truth(orientation, position)
+    return Truth(*poses_at(stamp_ns, reference.stamp_ns, reference.world_from_body, reference.position))
 
 
 def _truth(reference: Reference, stamp_ns: NDArray[np.int64], time_line: NDArray[np.int64]) -> Truth:
@@ -110,8 +85,8 @@ def errors_of_orientations(
         gauge = gauge_alignment(body_from_world(estimate[members]), body_from_world(reference[members])).numpy()
         off = Rotation.from_quat(gauge) * Rotation.from_quat(estimate[members]) * true.inv()
         z, w = off.as_quat().T[2:]
-        # The twist about z of the rotation from the true to the estimated orientation.
-        heading[members] = 2 * np.arctan2(np.sign(w) * z, np.abs(w))
+        # The twist about z of the rotation from the true to the estimated orientation; w is 0 at half a turn.
+        heading[members] = 2 * np.arctan2(np.where(w < 0, -z, z), np.abs(w))
     return OrientationErrors(angle, heading)
 
 

@@ -59,17 +59,19 @@ def read_parameter_file(path: Path) -> tuple[Values, list[str]]:
         the values by name; and a line for each parameter that the node does not have, which it ignores as well.
 
     Raises:
-        ReplayOptionError: no such file, not YAML, not a parameter file of the node, or of more than one, or an invalid
-            value.
+        ReplayOptionError: no such file, not YAML or one that refers to itself, not a parameter file of the node, or of
+            more than one, or an invalid value.
     """
     try:
-        content = _content(path.read_text(encoding="utf-8"))
+        nodes = [(name, list(_flat(said))) for name, said in _nodes(_content(path.read_text(encoding="utf-8")))]
     except (OSError, UnicodeDecodeError) as error:
         raise ReplayOptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     except yaml.YAMLError as error:
         raise ReplayOptionError(f"{path}: is not YAML: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise ReplayOptionError(f"{path}: is nested too deeply, or refers to itself; write its values out") from None
     of_node = {NODE_NAME, *_ANY_NODE}
-    meant = [(name, said) for name, said in _nodes(content) if name.rpartition("/")[2] in of_node]
+    meant = [(name, said) for name, said in nodes if name.rpartition("/")[2] in of_node]
     if not meant:
         raise ReplayOptionError(
             f"{path}: has no parameters of the node; expected '/{NODE_NAME}:' with 'ros__parameters:' below it, as "
@@ -79,7 +81,7 @@ def read_parameter_file(path: Path) -> tuple[Values, list[str]]:
     if len(named) > 1:
         raise ReplayOptionError(f"{path}: has parameters of several nodes ({', '.join(named)}); leave those of one")
     values, notes = {}, []
-    for name, value in (pair for _, said in meant for pair in _flat(said)):
+    for name, value in (pair for _, said in meant for pair in said):
         if name in PARAMETERS:
             values[name] = _checked(name, value, str(path))
         elif not name.startswith(_RCLPYS):
@@ -118,7 +120,7 @@ def read_settings(words: Iterable[str]) -> Values:
             raise ReplayOptionError(f"-p {word}: write name:=value")
         try:
             value = _content(text)
-        except yaml.YAMLError:
+        except (yaml.YAMLError, RecursionError):  # nested too deeply
             value = text
         values[name] = _checked(name, value, "-p")
     return values

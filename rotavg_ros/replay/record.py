@@ -136,7 +136,7 @@ class RunRecord:
         options: the parameters as users write them, by the node's names.
         wall_seconds: duration of the replay.
         interrupted: whether it was stopped by Ctrl-C, or by damage to the bag, before its end.
-        warnings: about how the bag was read, and edges that were not used.
+        warnings: about how the bag was read, edges that were not used, and references that do not fit.
         damage: what could not be read of the bag; None: nothing.
     """
 

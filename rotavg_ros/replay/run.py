@@ -109,7 +109,7 @@ def replay(
         ReplayError: no message, or none from which a keyframe could be made.
     """
     started = time.perf_counter()
-    start_ns, stop_ns = _bounds(bag, window)
+    start_ns, stop_ns = bounds(bag, window)
     torch.set_num_threads(plan.parameters.solver_threads or max(1, torch.get_num_threads() - 1))  # as in the node
     estimator = OnlineEstimator(plan.parameters.estimator)
     with Recording(recording, plan.parameters, estimator, answer_period_ns) as recorder:
@@ -240,8 +240,12 @@ def _flips(before: Answer, now: Answer) -> int:
     return int((before.outlier[old] != now.outlier[new])[is_known].sum())
 
 
-def _bounds(bag: BagReader, window: Window) -> tuple[int, int]:
-    """First moment to replay and the one after the last. The bag has messages."""
+def bounds(bag: BagReader, window: Window) -> tuple[int, int]:
+    """First moment to replay and the one after the last. The bag has messages.
+
+    Raises:
+        ReplayError: the window begins after the end.
+    """
     start_ns = bag.start_ns + round(window.start_s * NANOSECONDS)
     if start_ns >= bag.end_ns:
         raise ReplayError(

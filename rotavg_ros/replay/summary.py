@@ -38,7 +38,7 @@ def summarize(record: RunRecord, bag: Path, outcome: Outcome) -> dict[str, Any]:
         "flagged_closures": int((answer.outlier & closures).sum()),
         "outliers": int(answer.outlier.sum()),
         "components": answer.num_components,
-        "warnings": [*outcome.warnings, *answer.warnings],
+        "warnings": [*record.warnings, *answer.warnings],
         "robots": {robot.robot: _robot(robot, answer.component[robot.nodes]) for robot in record.robots},
         "waiting": outcome.estimator.counts().pending,
         "rejected": {reason: count for reason, count in record.rejected.items() if count},

@@ -111,6 +111,8 @@ class TrainingConfig:
         except (ValueError, yaml.YAMLError) as error:  # not UTF-8, a date that does not exist
             reason = str(error).splitlines()[0]
             raise TrainingConfigError(f"{path}: not a readable YAML file ({reason})") from None
+        except RecursionError:
+            raise TrainingConfigError(f"{path}: is nested too deeply; expected `key: value` lines") from None
         if not isinstance(content, dict):
             raise TrainingConfigError(f"{path}: expected `key: value` lines, found {type(content).__name__}")
         return cls.from_dict(content, str(path))

@@ -306,6 +306,30 @@ def test_odometrys_steps_are_kept_where_no_closure_states_a_translation(tmp_path
     np.testing.assert_allclose(read.edge_translation, [[1, 0, 0], [1, 0, 0], [np.nan] * 3], atol=1e-12)
 
 
+@pytest.mark.parametrize("offset_ns", [0, 30_000_000])
+def test_a_truth_of_other_moments_is_taken_between_them(tmp_path: Path, offset_ns: int) -> None:
+    """As a motion capture states it, which runs at a rate of its own; after 2.6 s it has lost the robot."""
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic(EDGE_TOPIC, RELATIVE_ROTATION)
+        for topic in (ODOM_TOPIC, TRUTH_TOPIC):
+            bag.add_topic(topic, ODOMETRY)
+        for tenths in range(10, 41):
+            stamp, shifted = tenths * 10**8, tenths * 10**8 - offset_ns
+            if tenths % 10 == 0:
+                bag.write(ODOM_TOPIC, stamp, odometry_message(stamp, np.zeros(3), np.array([0, 0, 0, 1.0]), "odom"))
+            if tenths <= 26:
+                turned = Rotation.from_rotvec([0, 0, 0.3 * shifted / 1e9]).as_quat()
+                truth = odometry_message(shifted, np.array([shifted / 1e9, 0, 0]), turned, "map")
+                bag.write(TRUTH_TOPIC, stamp, truth)
+        closure = edge(0, Keyframe(None, 10**9), Keyframe(None, 3 * 10**9))
+        bag.write(EDGE_TOPIC, 4 * 10**9, edge_message(closure))
+    read = read_graph_bag(tmp_path / "bag")
+    assert read.position_gt is not None and read.body_from_world_gt is not None
+    np.testing.assert_allclose(read.position_gt, [[1, 0, 0], [2, 0, 0], [np.nan] * 3, [np.nan] * 3], atol=1e-9)
+    turns = Rotation.from_quat(read.body_from_world_gt[:2]).as_rotvec()
+    np.testing.assert_allclose(turns, [[0, 0, -0.3], [0, 0, -0.6]], atol=1e-9)
+
+
 @pytest.mark.parametrize("by_stamp", [False, True])
 def test_an_edge_that_is_sent_again_counts_once(tmp_path: Path, by_stamp: bool) -> None:
     """As in a replay; another measurement of the same pair, or another edge of the same number, is not the same."""

@@ -16,12 +16,13 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from rotavg_ros.bags import message_types
+from rotavg_ros.bags import graph_bag, message_types
 from rotavg_ros.bags.graph_from_bag import read_graph_bag
 from rotavg_ros.bags.message_types import ODOMETRY, MessageTypeError, definitions_folder, typestore
 from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message, read_edge, read_odometry
 from rotavg_ros.bags.reader import BagReader, BagReadError
 from rotavg_ros.bags.writer import BagWriteError, BagWriter
+from rotavg_ros.cli.convert import format_of
 
 definitions_folder_of_the_sources = definitions_folder()
 START_NS = 1_700_000_000_123_456_789
@@ -347,6 +348,23 @@ def test_bags_of_others_with_types_of_their_own(tmp_path: Path, mode: Compressio
     with BagReader(tmp_path / "theirs") as bag:
         [(topic, time_ns, message)] = bag.decoded(["/thing"])
     assert (topic, time_ns, message.value, message.name) == ("/thing", 10, 2.5, "x")
+
+
+@pytest.mark.parametrize("storage", StoragePlugin)
+def test_a_compressed_recording_that_is_named_itself(tmp_path: Path, storage: StoragePlugin) -> None:
+    writer = Writer(tmp_path / "run", version=9, storage_plugin=storage)
+    writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/odom", ODOMETRY, typestore=typestore())
+        message = odometry_message(START_NS, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), "odom")
+        writer.write(connection, START_NS, typestore().serialize_cdr(message, ODOMETRY))
+    (recording,) = (tmp_path / "run").glob("*.zstd")
+    with BagReader(recording) as bag:
+        assert (bag.num_messages(), bag.path) == (1, tmp_path / "run")
+    assert format_of(recording) is graph_bag
+    alone = shutil.move(recording, tmp_path / recording.name)
+    with pytest.raises(BagReadError, match=f"unpack it by `unzstd {alone}`"):
+        BagReader(alone)
 
 
 def test_a_topic_of_two_types_is_of_the_one_with_more_messages(tmp_path: Path) -> None:

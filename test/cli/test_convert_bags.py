@@ -43,6 +43,13 @@ def test_an_existing_output_is_kept(tmp_path: Path, graph_path: Path, capsys: py
     assert main(["convert", str(graph_path), bag, "--overwrite"]) == 0
 
 
+@pytest.mark.parametrize("name", ["run.2024", "v1.2", "2024-01-31T12.30.05"])
+def test_a_folders_name_may_end_in_a_number(tmp_path: Path, graph_path: Path, name: str) -> None:
+    assert main(["convert", str(graph_path), str(tmp_path / name)]) == 0
+    assert (tmp_path / name / "metadata.yaml").exists()
+    assert main(["convert", str(tmp_path / name), str(tmp_path / "back.g2o")]) == 0
+
+
 @pytest.mark.parametrize("inside", ["bag.mcap", "graph.g2o", "stamps.txt"])
 def test_a_bag_with_an_input_in_it_is_kept(
     tmp_path: Path, graph_path: Path, capsys: pytest.CaptureFixture[str], inside: str

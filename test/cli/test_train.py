@@ -116,6 +116,7 @@ def test_mistakes_take_one_line(
         ("family: cars", "family is 'cars'"),
         ("epochs: {", "not a readable YAML file"),
         ("goes_on_from: 2024-13-45", "not a readable YAML file"),
+        ("nodes: " + "[" * 5000 + "]" * 5000, "is nested too deeply"),
         ("learning_rate: .nan", "learning_rate is nan"),
         ("seed: -1", "seed is -1"),
         ("graphs: .inf", "graphs is inf"),

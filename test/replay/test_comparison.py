@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.metrics import position_errors
@@ -57,6 +59,13 @@ def test_orientation_and_heading_errors() -> None:
     errors = errors_of_orientations(estimate.as_quat(), Truth(true.as_quat(), None))
     np.testing.assert_allclose(errors.heading, heading, atol=1e-4)
     np.testing.assert_allclose(errors.angle, np.abs(heading), atol=1e-4)
+
+
+def test_a_heading_that_is_off_by_half_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    none, half = [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]
+    monkeypatch.setattr("rotavg_ros.replay.comparison.gauge_alignment", lambda *_: torch.tensor(none))
+    errors = errors_of_orientations(np.array([none, half]), Truth(np.array([none, none]), None))
+    np.testing.assert_array_equal(np.abs(errors.heading), [0, np.pi])
 
 
 def test_components_are_turned_by_themselves_and_gaps_stay_unknown() -> None:

@@ -255,8 +255,14 @@ def test_a_reference_that_loses_its_position_now_and_then(tmp_path: Path) -> Non
     ],
 )
 def test_a_reference_of_another_kind(
-    tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str], content: str, says: str
+    tmp_path: Path,
+    small: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    content: str,
+    says: str,
 ) -> None:
+    monkeypatch.setattr("rotavg_ros.replay.run.replay", lambda *_: pytest.fail("replayed first"))
     truth = tmp_path / "truth.txt"
     truth.write_text(content)
     output = ["--output", str(tmp_path / "out"), "--no-report"]
@@ -310,6 +316,15 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path, small: Path) -> None:
     assert "interrupted after" in told
     assert {path.name for path in output.iterdir()} >= {"run.mcap", "summary.json", "trajectory.tum"}
     assert not list(output.glob(".unfinished*"))
+
+
+def test_an_interrupted_replay_is_written_although_the_reference_has_more_rows(tmp_path: Path, small: Path) -> None:
+    truth, output = tmp_path / "truth.txt", tmp_path / "out"
+    truth.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 50)
+    code, _, complaints = interrupt_replay(small, output, signal.SIGINT, "--reference", str(truth))
+    assert code == 130
+    assert f"not compared with the reference {truth}: 50 poses without stamps, but" in complaints
+    assert (output / "summary.json").exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.large)])

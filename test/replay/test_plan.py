@@ -167,6 +167,23 @@ def test_the_nodes_own_parameter_file(tmp_path: Path) -> None:
         read_parameter_file(path)
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        "/rotavg: &here\n  below: *here\n",
+        "/rotavg:\n  ros__parameters: &here\n    below: *here\n",
+        f"/rotavg:\n  ros__parameters:\n    robots: {'[' * 5000}{']' * 5000}\n",
+    ],
+)
+def test_a_file_without_an_end_is_refused(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "node.yaml"
+    path.write_text(content)
+    with pytest.raises(ReplayOptionError, match=rf"{path}: is nested too deeply, or refers to itself"):
+        read_parameter_file(path)
+    with pytest.raises(ReplayOptionError, match="it must be a list of texts"):
+        read_settings([f"robots:={'[' * 5000}{']' * 5000}"])
+
+
 ANGLE = {"keyframe_angle_deg": 7.0}
 
 
