@@ -38,5 +38,5 @@ def data_folder(arguments: argparse.Namespace, needed: Sequence[str]) -> Path:
         )
     missing = [name for name in needed if not (folder / name).exists()]
     if missing:
-        raise DataFolderError(f"{folder}: lacks {', '.join(missing)}; see the documentation of the data sets")
+        raise DataFolderError(f"{folder}: lacks {', '.join(missing)}; check --data or ${_VARIABLE}")
     return folder

@@ -153,7 +153,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
             subparser.description = (options.__doc__ or command.help).strip()
             subparser.formatter_class = argparse.RawDescriptionHelpFormatter
             options.add_arguments(subparser)
-    parsed = parser.parse_args(arguments)
+    parsed, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        subparsers.choices[parsed.command].error(f"unrecognized arguments: {' '.join(unknown)}")
     parsed.command_line = command_line(parser, parsed)
     return parsed
 

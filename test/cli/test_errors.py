@@ -59,7 +59,7 @@ ROTAVG = "import sys; from rotavg_ros.cli.main import main; sys.exit(main())"
         (["solve", "x.g2o", "--output", "out", "--profile", "x"], "invalid choice: 'x'"),
         (["solve", "x.g2o", "--output", "out", "--refine", "-1"], "must be 0 or more"),
         (["solve", "x.g2o", "--output", "out", "--refine", "many"], "--refine: 'many' is not a whole number"),
-        (["solve", "x.g2o", "--output", "out", "--frob"], "unrecognized arguments: --frob"),
+        (["solve", "x.g2o", "--output", "out", "--frob"], "unrecognized arguments: --frob; see rotavg solve --help"),
         (["solve", "x.g2o", "--output", "out", "--method", "magic"], "magic"),
         (["replay", "bag", "--output", "out", "--start", "1e300"], "--start: is 1e300; it must be 1e+12 or less"),
         (["replay", "bag", "--output", "out", "--duration", "1e300"], "--duration: is 1e300; it must be 1e+12 or less"),

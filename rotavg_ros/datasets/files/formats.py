@@ -19,6 +19,12 @@ _FORMAT_OF_SUFFIX = {
 }
 
 
+# How recordings begin, and their suffixes.
+_RECORDINGS = {b"\x89MCAP": ".mcap", b"SQLite format 3": ".db3", b"#ROSBAG V": ".bag"}
+# Numbers in a row of a trajectory.
+_TRAJECTORIES = {8: "TUM", 12: "KITTI"}
+
+
 def read_graph(path: str | Path) -> GraphFile:
     """Read a view-graph in g2o or TORO dialect, 1DSfM ``EGs.txt``, npz or Lund's MATLAB form; the content decides.
 
@@ -79,5 +85,13 @@ def _format_of_content(path: Path, head: bytes) -> ModuleType:
         return npz
     if head.startswith(b"MATLAB ") or path.suffix.lower() == ".mat":
         return lund
+    for start, suffix in _RECORDINGS.items():
+        if head.startswith(start):
+            what = f"is a bag; `rotavg replay` takes it, and `rotavg convert` makes a view-graph of a {suffix} file"
+            raise GraphFileError.at(path, None, what)
     first_row = next((row for block in read_blocks(path) for _, row in block), [b""])
+    if first_row[0][:1] in NUMBER_STARTS and len(first_row) in _TRAJECTORIES:
+        kind = _TRAJECTORIES[len(first_row)]
+        what = f"{len(first_row)} numbers a row, as in a trajectory ({kind}), which has no edges; `rotavg replay "
+        raise GraphFileError.at(path, 1, f"{what}--reference` compares with one")
     return onedsfm if first_row[0][:1] in NUMBER_STARTS else g2o

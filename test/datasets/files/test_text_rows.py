@@ -108,3 +108,23 @@ def test_the_answer_to_a_gzipped_graph_has_its_name(tmp_path: Path) -> None:
     graphs = [written(tmp_path / f"{name}.g2o.gz", packed(TEXTS["graph.toro"])) for name in "ab"]
     assert main(["solve", *map(str, graphs), "--output", str(tmp_path / "out")]) == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (
+            b"\x89MCAP0\r\n\x01",
+            "is a bag; `rotavg replay` takes it, and `rotavg convert` makes a view-graph of a .mcap",
+        ),
+        (b"SQLite format 3\x00\x10", "of a .db3 file"),
+        (b"#ROSBAG V2.0\nE\x00\x00", "of a .bag file"),
+        (b"# stamp x y z qx qy qz qw\n1.5 0 0 0 0 0 0 1\n", r"8 numbers a row, as in a trajectory \(TUM\)"),
+        (b"1 0 0 0 0 1 0 0 0 0 1 0\n", r"12 numbers a row, as in a trajectory \(KITTI\), which has no edges"),
+    ],
+)
+def test_recordings_and_trajectories_are_no_graphs(tmp_path: Path, content: bytes, complaint: str) -> None:
+    path = tmp_path / "run"
+    path.write_bytes(content)
+    with pytest.raises(GraphFileError, match=complaint):
+        read_graph(path)
