@@ -153,7 +153,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
             subparser.description = (options.__doc__ or command.help).strip()
             subparser.formatter_class = argparse.RawDescriptionHelpFormatter
             options.add_arguments(subparser)
-    parsed, unknown = parser.parse_known_args(arguments)
+    parsed: argparse.Namespace
+    parsed, unknown = parser.parse_known_args(arguments)  # type: ignore[no-untyped-call]
     if unknown:
         subparsers.choices[parsed.command].error(f"unrecognized arguments: {' '.join(unknown)}")
     parsed.command_line = command_line(parser, parsed)
