@@ -258,7 +258,8 @@ class _Warm:
         """Warm up for a kind of graph."""
         if has_odometry not in self._is_warm:
             self._is_warm.add(has_odometry)
-            self._solve_graph(_warm_up_graph(has_odometry))
+            with working("preparing (the first time on a machine code is compiled)"):
+                self._solve_graph(_warm_up_graph(has_odometry))
 
     def for_graph(self, graph: ViewGraph) -> Callable[[ViewGraph], Solution]:
         """The solver, warm for a graph."""

@@ -7,10 +7,13 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, suppress
+from pathlib import Path
 
 import pytest
 
+from rotavg_ros.cli.main import main
 from rotavg_ros.cli.progress import progress, seconds_bar, working
+from rotavg_ros.errors import UserError
 
 PATIENCE_S = 60.0
 
@@ -52,6 +55,17 @@ def test_one_long_step_counts_seconds(fails: bool) -> None:
         if fails:
             raise InterruptedError
     assert terminal.getvalue().endswith("\r\033[K")
+
+
+def test_solve_counts_seconds_while_it_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def compiled(*_: object, **__: object) -> None:
+        wait_for_seconds(terminal, r"\rpreparing \([^\r]*compiled\): (\d+) s ")
+        raise UserError("no such method")
+
+    monkeypatch.setattr("rotavg_ros.cli.solve.solve", compiled)
+    (tmp_path / "x.g2o").write_text("EDGE_SE2 0 1 1 0 0.5 1 0 0 1 0 1\n")
+    with on_a_terminal() as terminal:
+        assert main(["solve", str(tmp_path / "x.g2o"), "--output", str(tmp_path / "out")]) == 2
 
 
 def test_a_short_step_shows_nothing() -> None:
