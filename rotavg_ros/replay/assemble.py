@@ -133,7 +133,7 @@ def _from_file(path: Path, keyframes_ns: NDArray[np.int64], odometry_ns: NDArray
         if stamps_ns is None:
             what = (
                 f"{rows} poses without stamps, but {len(odometry_ns)} odometry messages and {len(keyframes_ns)} "
-                "keyframes were replayed; give a file with stamps (TUM), or replay the whole bag"
+                "keyframes in what is replayed; give a file with stamps (TUM), or replay the whole bag"
             )
             raise GraphFileError.at(path, None, what)
         if (np.diff(stamps_ns) <= 0).any():
