@@ -8,6 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import ViewGraph, rotations, solve
+from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver.sfm.certainty.attachment import Attachment, ErrorDensity
 from rotavg_ros.solver.sfm.refinement import PRIORS
 from rotavg_ros.solver.sfm.starts.parts import Parts
@@ -95,6 +96,39 @@ def test_probabilities_are_those_of_brute_force(turns: list[list[float]]) -> Non
 def _density() -> ErrorDensity:
     none = np.zeros(0)
     return ErrorDensity.of(none, none, none.astype(np.int64), np.array([_FALSE]), np.array([_SCALE]))
+
+
+def test_a_camera_is_turned_to_where_more_edges_have_it() -> None:
+    """Two agree on a turn, one on the answer; with two that agree on the answer as well it stays."""
+    turns = np.radians([[0.0, 0, 0], [80, 0, 0], [82, 1, 0]])
+    found, graph = _attached(Rotation.from_rotvec(turns))
+    at = np.ascontiguousarray(random_truth(graph.num_nodes, 0).as_quat().T)
+    turned = found.likelier(at)
+    assert turned is not None
+    moved = (Rotation.from_quat(at.T).inv() * Rotation.from_quat(turned.T)).as_rotvec(degrees=True)
+    np.testing.assert_allclose(moved[:-1] - moved[0], 0, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(moved[-1] - moved[0]), 80, atol=3)
+    stays, _ = _attached(Rotation.from_rotvec(np.concatenate((turns, np.radians([[1.0, 0, 2]])))))
+    assert stays.likelier(at) is None
+    open_, _ = _attached(_apart(4))
+    assert open_.likelier(at) is None
+
+
+def test_the_answer_follows_the_edges_that_agree_not_the_lowest_cost() -> None:
+    """Of nine edges of a camera three are good; the cost of a turn by 60°, where two agree, is less."""
+    source, target = np.triu_indices(30, k=1)
+    few = np.arange(9)
+    source, target = np.append(source, few), np.append(target, np.full(9, 30))
+    truth, noise = random_truth(31, 9), small_noise(len(source), 1.0, 3).as_rotvec()
+    good, agreeing = [[0, 1, 0], [1, 0, 0], [0, 0, 1]], [[60, 0, 0], [61, 0, 0]]
+    noise[-9:] = np.radians([*good, *agreeing, [100, 0, 0], [90, 40, 0], [90, -40, 0], [85, 0, 35]])
+    stated = Rotation.from_rotvec(noise[-9:])
+    cost = [float(np.sqrt((stated * turn.inv()).magnitude()).sum()) for turn in (stated[0], stated[3])]
+    assert cost[0] > 1.1 * cost[1]
+    graph = measured(truth, source, target, Rotation.from_rotvec(noise))
+    solution = solve(graph, profile="sfm")
+    error = orientation_errors(solution.body_from_world, as_quaternions(truth))
+    assert float(torch.rad2deg(error[-1])) < 5
 
 
 def test_false_edges_that_err_by_one_angle_do_not_turn_a_camera() -> None:
