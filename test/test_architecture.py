@@ -124,8 +124,8 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "starts": {"cycles", "priors", "refinement", "step"},
         "certainty": {"laplacians", "priors", "starts"},
         "solve": {
-            *("certainty", "consensus", "cycles", "options", "refinement", "series", "starts", "stated"),
-            "step",
+            *("certainty", "consensus", "cycles", "options", "priors", "refinement", "series", "starts"),
+            *("stated", "step"),
         },
     },
     "solver/slam": {

@@ -173,7 +173,8 @@ def test_stages_follow_the_method() -> None:
     paper = solve(graph, profile="sfm", method="neurora-v1").stage_seconds
     assert list(paper) == ["order", "clean", "cycles", "bootstrap", "fine-tune"]
     whole = solve(graph, profile="sfm").stage_seconds
-    assert list(whole) == ["order", "clean", "cycles", "bootstrap", "fine-tune", "refine", "consensus", "uncertainty"]
+    refined = ["refine", "consensus", "attach", "uncertainty"]
+    assert list(whole) == ["order", "clean", "cycles", "bootstrap", "fine-tune", *refined]
     for without_cycles in ("spt", "neurora-paper", "neurora-without-cycles"):
         assert "cycles" not in solve(graph, profile="sfm", method=without_cycles).stage_seconds
 

@@ -41,6 +41,8 @@ from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # For graphs with more edges it pays to measure which tile sizes are fastest on this machine.
 _TUNING_PAYS = 200_000
+# Quaternions that differ by less are the same.
+_ROUNDING = 1e-9
 _NEARLY_AS_GOOD = (
     "of two answers, in which {} of {} orientations differ by more than 20°, neither fits clearly better; part of the "
     "views is joined to the rest by few edges, or by edges that contradict each other: look whether it fits, or match "
@@ -206,16 +208,15 @@ def _reattached(cleared: _Cleared, answer: _Answer, weights: EdgeWeights, priors
     graph, structure = cleared.judged.measured, cleared.structure
     for _ in range(ATTACHMENT.rounds):
         scored, orientations = _scored(cleared, answer), answer.body_from_world
-        turned = None if scored.attached is None else scored.attached.likelier(_rows(orientations))
+        turned = None if scored.attached is None else scored.attached.likelier()
         if turned is None:
             return answer._replace(scored=scored)
         start = torch.from_numpy(np.ascontiguousarray(turned.T)).to(orientations)
-        # Components are answered as if each were alone.
-        is_turned = torch.zeros_like(structure.roots).index_add_(
-            0, structure.component, (start != orientations).any(dim=1).long()
-        )
+        # Components are answered as if each were alone: those in which nothing is turned keep their answer.
+        is_turned = torch.zeros_like(structure.roots, dtype=torch.bool)
+        is_turned[structure.component[(start - orientations).abs().amax(dim=1) > _ROUNDING]] = True
         refined = settle(graph, start, weights, structure, priors).body_from_world
-        orientations = torch.where((is_turned > 0)[structure.component][:, None], refined, orientations)
+        orientations = torch.where(is_turned[structure.component][:, None], refined, orientations)
         answer = answer._replace(body_from_world=orientations, residual=None)
     return answer
 

@@ -87,6 +87,7 @@ class Attachment:
 
     Attributes:
         parts: the parts.
+        body_from_world: ``(4, N)`` the answer.
         part: ``(P,)`` index of the part that an edge joins.
         is_right: ``(K,)`` probability that the part is not turned.
         variance: ``(K,)`` rad², expected square of each component of its turn.
@@ -97,6 +98,7 @@ class Attachment:
     """
 
     parts: Parts
+    body_from_world: np.ndarray
     part: np.ndarray
     is_right: np.ndarray
     variance: np.ndarray
@@ -130,14 +132,14 @@ class Attachment:
             total += np.bincount(part[one], mass, len(node))
             variance += np.bincount(part[one], mass * angle[one] ** 2 / 3, len(node))
             elsewhere += np.bincount(other, mass[which] * peaks.good, len(part))
-        return cls(parts, part, here / total, variance / total, elsewhere / total[part], turns)
+        return cls(parts, body_from_world, part, here / total, variance / total, elsewhere / total[part], turns)
 
-    def likelier(self, body_from_world: np.ndarray) -> np.ndarray | None:
+    def likelier(self) -> np.ndarray | None:
         """The answer ``(4, N)`` with parts turned that are likelier elsewhere; None if none is by enough."""
         chosen = self.parts.gaining(self.turns)
         # Two edges leave the turn open, and the misfit is spread between them.
         chosen &= np.bincount(self.part, minlength=len(chosen)) >= _SEVERAL
-        return self.parts.turned(body_from_world, self.turns, chosen) if chosen.any() else None
+        return self.parts.turned(self.body_from_world, self.turns, chosen) if chosen.any() else None
 
     def scores(self, score: np.ndarray) -> np.ndarray:
         """Probabilities ``(M,)`` that edges are false, given those under the answer as it is."""
