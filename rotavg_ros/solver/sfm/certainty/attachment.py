@@ -93,8 +93,8 @@ class Attachment:
         variance: ``(K,)`` rad², expected square of each component of its turn.
         elsewhere: ``(P,)`` expected probability that the edge is good if the part is turned, times the probability that
             it is.
-        turns: the likeliest other turn of each part. Its change is negative if it is likelier than the answer, and than
-            that all edges are false, by ``AttachmentPriors.ahead``.
+        turns: the likeliest other turn of each part that several edges join. Its change is negative if it is likelier
+            than the answer, and than that all edges are false, by ``AttachmentPriors.ahead``.
     """
 
     parts: Parts
@@ -137,8 +137,6 @@ class Attachment:
     def likelier(self) -> np.ndarray | None:
         """The answer ``(4, N)`` with parts turned that are likelier elsewhere; None if none is by enough."""
         chosen = self.parts.gaining(self.turns)
-        # Two edges leave the turn open, and the misfit is spread between them.
-        chosen &= np.bincount(self.part, minlength=len(chosen)) >= _SEVERAL
         return self.parts.turned(self.body_from_world, self.turns, chosen) if chosen.any() else None
 
     def scores(self, score: np.ndarray) -> np.ndarray:
@@ -174,7 +172,7 @@ def _likeliest(
     present: np.ndarray,
     found: list[tuple[_Peaks, np.ndarray, np.ndarray, np.ndarray]],
 ) -> Turns:
-    """The turn ``(4, P)`` of most mass for each part ``(K,)``, against the ``present`` logarithm of a mass ``(K,)``."""
+    """For each part, of its edges' stated turns ``(4, P)`` the one of most mass, beside the ``present`` one ``(K,)``."""
     change, turn = np.full(len(node), np.inf), np.tile(np.array([[0.0], [0.0], [0.0], [1.0]]), len(node))
     tries = np.concatenate([one for _, one, *_ in found])
     mass = np.concatenate([peaks.log_mass for peaks, *_ in found])
@@ -183,6 +181,8 @@ def _likeliest(
     chosen = order[first]
     change[at] = present[at] + PRIORS.ahead - mass[chosen]
     turn[:, at] = stated[:, tries[chosen]]
+    # Two edges leave the turn open, and the misfit is spread between them.
+    change[np.bincount(part, minlength=len(node)) < _SEVERAL] = np.inf
     return Turns(node, change, turn)
 
 
