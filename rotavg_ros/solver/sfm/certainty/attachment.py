@@ -172,7 +172,7 @@ def _likeliest(
     present: np.ndarray,
     found: list[tuple[_Peaks, np.ndarray, np.ndarray, np.ndarray]],
 ) -> Turns:
-    """For each part, of its edges' stated turns ``(4, P)`` the one of most mass, beside the ``present`` one ``(K,)``."""
+    """Of the turns ``(4, P)`` stated for each part the one of most mass, beside the ``present`` one ``(K,)``."""
     change, turn = np.full(len(node), np.inf), np.tile(np.array([[0.0], [0.0], [0.0], [1.0]]), len(node))
     tries = np.concatenate([one for _, one, *_ in found])
     mass = np.concatenate([peaks.log_mass for peaks, *_ in found])
