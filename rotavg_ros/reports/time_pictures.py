@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from rotavg_ros.reports.facts import RunFacts
@@ -110,8 +110,10 @@ def ticks(facts: RunFacts, theme: Theme) -> Figure | None:
         if chosen.any():
             label = f"{name} ({int(chosen.sum())})"
             upper.plot(time[chosen], milliseconds[chosen], marker, color=colour, markersize=4, label=label)
-    upper.set_ylim(bottom=0, top=1.15 * float(milliseconds.max(initial=0.0)) or 1.0)
-    upper.margins(x=0.02)
+    # A first run on a machine compiles for a minute, other ticks take milliseconds.
+    upper.set_yscale("log")
+    upper.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    upper.margins(x=0.02, y=0.15)
     theme.dress(upper, "Time of every tick", y="milliseconds", legend_rows=1)
     for name, values, colour in (
         ("keyframes", [tick.keyframes for tick in ticks], theme.corrected),

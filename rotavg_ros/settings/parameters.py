@@ -148,7 +148,10 @@ class NodeParameters:
         _check_orientations("odometry", self.odometry_sensor_orientations, len(self.odometry_topics))
         _check_orientations("edge", self.edge_sensor_orientations, len(self.edge_topics))
         for entry in self.edge_topics:
-            if entry.partition(":")[2] in BRINGS_KEYFRAMES and self.estimator.keyframe_source != "edges":
+            topic, colon, message_type = entry.partition(":")
+            if entry and not (topic and (message_type or not colon)):
+                raise OptionError(f"edge_topics: {entry!r} lacks a topic or a type; write topic or topic:type")
+            if message_type in BRINGS_KEYFRAMES and self.estimator.keyframe_source != "edges":
                 raise OptionError(f"edge topic {entry!r} brings keyframes of its own; set keyframe_source to edges")
 
     def _check_forwards(self) -> None:

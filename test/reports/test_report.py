@@ -23,6 +23,7 @@ from rotavg_ros.reports.page import page_of
 from rotavg_ros.reports.report import PICTURES
 from rotavg_ros.reports.tables import WHY_REFUSED
 from rotavg_ros.reports.theme import DARK, LIGHT
+from rotavg_ros.reports.time_pictures import ticks
 from rotavg_ros.view_graph import EdgeKind
 
 from .records import record_of, simulated_run, two_robots, without_closures, without_positions, without_reference
@@ -241,6 +242,20 @@ def test_ticks_are_shown_since_the_start_whatever_the_recorders_clock(record: Ru
     usual = RunFacts(record).tick_time
     begin = later_s if abs(later_s) < record.duration_s else -float(usual[0] * facts.clock.seconds)
     np.testing.assert_allclose(facts.tick_time, usual + begin / facts.clock.seconds, atol=1e-9)
+
+
+def test_a_tick_that_compiles_for_a_minute_hides_no_other(record: RunRecord) -> None:
+    slow = [replace(record.ticks[0], seconds=60.0), *record.ticks[1:]]
+    figure = ticks(RunFacts(replace(record, ticks=tuple(slow))), LIGHT)
+    assert figure is not None
+    figure.canvas.draw()
+    upper = figure.axes[0]
+    shown = upper.transAxes.inverted().transform(
+        upper.transData.transform([[0.0, 1000 * seconds] for seconds in (min(t.seconds for t in slow[1:]), 60.0)])
+    )
+    assert 0 < shown[0, 1] < shown[1, 1] < 1
+    others = upper.transData.transform([[0.0, 1000 * tick.seconds] for tick in slow[1:]])[:, 1]
+    assert np.ptp(others) > 5  # pixels
 
 
 def judged(record: RunRecord, outlier: np.ndarray, rotation_score: np.ndarray) -> RunFacts:

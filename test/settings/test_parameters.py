@@ -82,6 +82,8 @@ def test_a_change_keeps_the_rest_and_ignores_other_nodes_parameters() -> None:
             "robots names '1' and 'robot_1', whose topics would both begin with robot_1/",
         ),
         ({"edge_topics": ["graph:rtabmap_msgs/msg/MapGraph"]}, "edge topic 'graph:rtabmap_msgs/msg/MapGraph' brings "),
+        ({"edge_topics": ["closures:"]}, "edge_topics: 'closures:' lacks a topic or a type; write topic or topic:type"),
+        ({"edge_topics": [":std_msgs/msg/String"]}, "edge_topics: ':std_msgs/msg/String' lacks a topic or a type"),
         ({"autosave_period_s": 5.0}, "autosave_period_s is set but state_file is empty; name a file"),
     ],
 )
