@@ -34,7 +34,7 @@ def _forget(traffic: Traffic) -> None:
         record.clear()
 
 
-@pytest.mark.parametrize(("method", "waits"), [("neurora", 300), ("neurora-v2", 59), ("neurora-round", 301)])
+@pytest.mark.parametrize(("method", "waits"), [("neurora", 309), ("neurora-v2", 59), ("neurora-round", 310)])
 def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> None:
     graph = _graph()
     with pretended_gpu() as traffic:

@@ -37,7 +37,7 @@ def orientation_columns(
     """
     sigma_deg = np.degrees(np.where(np.isfinite(uncertainty), uncertainty, np.nan))
     quaternion = [Column(name, world_from_body[:, i], decimals=12) for i, name in enumerate(("qx", "qy", "qz", "qw"))]
-    return [Column("id", ids), *quaternion, Column("component", component), Column("sigma_deg", sigma_deg, decimals=4)]
+    return [Column("id", ids), *quaternion, Column("component", component), Column("sigma_deg", sigma_deg, decimals=6)]
 
 
 def edge_columns(

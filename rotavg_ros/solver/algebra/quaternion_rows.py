@@ -37,6 +37,11 @@ def normalize(a: np.ndarray) -> np.ndarray:
     return np.asarray(a / np.sqrt(np.einsum("in,in->n", a, a)))
 
 
+def identities(count: int) -> np.ndarray:
+    """``(4, count)``."""
+    return np.tile(np.array([[0.0], [0.0], [0.0], [1.0]]), count)
+
+
 def angle(cosine: np.ndarray) -> np.ndarray:
     """Angles in rad of rotations whose quaternions have this w, of either sign."""
     return np.asarray(2 * np.arccos(np.minimum(np.abs(cosine), 1.0)))

@@ -189,8 +189,8 @@ class StartPriors:
     """Where the refinement begins besides CleanNet, tree and FineNet (``starts/``).
 
     On a tuning graph of each of 24 kinds, half the value made means worse by 2 % (``sparse_degree``, ``tree_degree``)
-    or 5 % (``part_edges``, ``turned_rounds``), each on one or two of the kinds; ``rounds`` changed nothing there, and
-    no number changed anything when it was doubled.
+    or 5 % (``part_edges``, ``turned_rounds``), each on one or two of the kinds, and twice the value changed them by
+    .4 % at most; ``rounds`` changed nothing.
 
     Attributes:
         sparse_degree: with fewer edges per node, all starts are tried on all edges; with more, one start is, on
@@ -236,6 +236,25 @@ class AttachmentPriors:
     least_scale: float = float(np.radians(0.1))
     shells: tuple[float, ...] = tuple(float(np.radians(degrees)) for degrees in (20, 30, 45, 60, 90, 120, 150, 180))
     shell_edges: float = 2.0
+
+
+@dataclass(frozen=True)
+class UncertaintyPriors:
+    """How the deviations of orientations are estimated (``certainty/uncertainty.py``). No orientation depends on them.
+
+    Attributes:
+        samples: number of random samples; what is sampled of a standard deviation errs by 9 %.
+        most_edges: with more edges in well-knit components, samples would take seconds, and none is stated.
+        least_weight: weight of edges that are surely wrong, which keeps the graph connected.
+        flagged: edges of lower scores count as checks of each other.
+        least_noise: rad², floor of the noise's variance, numerical, for graphs without any.
+    """
+
+    samples: int = 64
+    most_edges: int = 1_000_000
+    least_weight: float = 1e-3
+    flagged: float = 0.5
+    least_noise: float = 1e-12
 
 
 @dataclass(frozen=True)

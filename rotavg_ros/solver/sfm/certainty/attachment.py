@@ -173,7 +173,7 @@ def _likeliest(
     found: list[tuple[_Peaks, np.ndarray, np.ndarray, np.ndarray]],
 ) -> Turns:
     """Of the turns ``(4, P)`` stated for each part the one of most mass, beside the ``present`` one ``(K,)``."""
-    change, turn = np.full(len(node), np.inf), np.tile(np.array([[0.0], [0.0], [0.0], [1.0]]), len(node))
+    change, turn = np.full(len(node), np.inf), rows.identities(len(node))
     tries = np.concatenate([one for _, one, *_ in found])
     mass = np.concatenate([peaks.log_mass for peaks, *_ in found])
     order = np.lexsort((tries, -mass, part[tries]))

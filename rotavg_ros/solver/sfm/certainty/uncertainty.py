@@ -20,19 +20,11 @@ from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem, incidence_matrix
 from rotavg_ros.solver.sfm.certainty.probes import probe_signs
 from rotavg_ros.solver.sfm.laplacians.scalar import ScalarLaplacian
-from rotavg_ros.solver.sfm.priors import RefinementPriors
+from rotavg_ros.solver.sfm.priors import RefinementPriors, UncertaintyPriors
 from rotavg_ros.view_graph import ViewGraph
 
 _WELL_KNIT_DEGREE = RefinementPriors().well_knit_degree
-# What is sampled of a standard deviation errs by 9 %.
-_SAMPLES = 64
-# With more edges, the samples would take seconds.
-_MOST_EDGES = 1_000_000
-# Weight of edges that are surely wrong, which keeps the graph connected.
-_LEAST_WEIGHT = 1e-3
-_FLAGGED = 0.5
-# Floor of the variance, rad², for graphs without any noise.
-_LEAST_NOISE = 1e-12
+PRIORS = UncertaintyPriors()
 
 
 class References(NamedTuple):
@@ -78,10 +70,10 @@ def variances(graph: ViewGraph, angle: Tensor, score: Tensor, bridge: Tensor, to
     size = torch.bincount(to.component, minlength=count)
     edges = torch.bincount(to.component[graph.source], minlength=count)
     is_checked, is_loose = edges >= size, 2 * edges < _WELL_KNIT_DEGREE * size
-    weight, noise = (1 - score).clamp(min=_LEAST_WEIGHT), noise_variance(graph, angle, score, to.component)
+    weight, noise = (1 - score).clamp(min=PRIORS.least_weight), noise_variance(graph, angle, score, to.component)
     turned = torch.zeros_like(score)
     turned[bridge] = score[bridge] * rotations.RANDOM_VARIANCE
-    weight = 1 / (1 / weight + turned / noise[graph.source].clamp(min=_LEAST_NOISE))
+    weight = 1 / (1 / weight + turned / noise[graph.source].clamp(min=PRIORS.least_noise))
     found = weight.new_full((graph.num_nodes,), torch.nan)
     for chosen, sample in ((is_checked & is_loose, _by_factorisation), (is_checked & ~is_loose, _by_iterations)):
         nodes = chosen[to.component]
@@ -102,9 +94,9 @@ def noise_variance(graph: ViewGraph, angle: Tensor, score: Tensor, component: Te
     def sums(value: Tensor) -> Tensor:
         return value.new_zeros(count).index_add_(0, of_edge, value)
 
-    weight = (1 - score).clamp(min=_LEAST_WEIGHT)
+    weight = (1 - score).clamp(min=PRIORS.least_weight)
     # Number of believed edges beyond a spanning tree, at least one.
-    checks = (sums((score < _FLAGGED).to(weight)) - torch.bincount(component, minlength=count) + 1).clamp(min=1)
+    checks = (sums((score < PRIORS.flagged).to(weight)) - torch.bincount(component, minlength=count) + 1).clamp(min=1)
     return (sums(weight * angle.to(weight).square()) / (3 * checks))[component]
 
 
@@ -140,12 +132,11 @@ def _by_factorisation(graph: ViewGraph, weight: Tensor, to: References) -> _Samp
 
 def _by_iterations(graph: ViewGraph, weight: Tensor, to: References) -> _Samples | None:
     """Samples for the nodes that have edges, in well-knit components; None if the iterations do not converge."""
-    if graph.num_edges > _MOST_EDGES:
+    if graph.num_edges > PRIORS.most_edges:
         return None
-    weight = weight.float()
     force = _forces(graph, weight, to)
     value, is_solved = ScalarLaplacian(SortedEdges.of(graph), weight, to.component).solve(force.t().contiguous())
-    return _Samples(force.double(), value.t().double()) if is_solved else None
+    return _Samples(force, value.t()) if is_solved else None
 
 
 def _forces(graph: ViewGraph, weight: Tensor, to: References) -> Tensor:
@@ -155,7 +146,7 @@ def _forces(graph: ViewGraph, weight: Tensor, to: References) -> Tensor:
     incidence = incidence_matrix(graph.num_nodes, *ends).astype(root.dtype)
     signs = _signs(*ends, to)
     # A few columns at a time: as floating-point numbers, all of them would take much memory.
-    parts = [incidence @ (root[:, None] * few) for few in np.array_split(signs, range(8, _SAMPLES, 8), axis=1)]
+    parts = [incidence @ (root[:, None] * few) for few in np.array_split(signs, range(8, PRIORS.samples, 8), axis=1)]
     return torch.from_numpy(np.concatenate(parts, axis=1)).to(weight)
 
 
@@ -165,9 +156,9 @@ def _signs(source: np.ndarray, target: np.ndarray, to: References) -> np.ndarray
     first = np.full(len(to.node), len(component))
     np.minimum.at(first, component, np.arange(len(component)))
     of_edge = component[source]
-    signs = np.empty((len(source), _SAMPLES), dtype=np.int8)
+    signs = np.empty((len(source), PRIORS.samples), dtype=np.int8)
     order = np.argsort(of_edge, kind="stable")
     for members in np.split(order, np.flatnonzero(np.diff(of_edge[order])) + 1):
         start = first[of_edge[members[0]]]
-        signs[members] = probe_signs(source[members] - start, target[members] - start, _SAMPLES)
+        signs[members] = probe_signs(source[members] - start, target[members] - start, PRIORS.samples)
     return signs

@@ -9,8 +9,9 @@ from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.algebra.sparse.conjugate_gradients import Stop, conjugate_gradients
 from rotavg_ros.solver.sfm.laplacians.block import MAX_ITERATIONS, Arrivals, Components, arriving
 
-# Share of the first residual at which iterations end: a sampled value errs by far more.
-_SOLVED = 1e-3
+# Share of the first residual at which iterations end. What two parts differ by that only rejected edges join leaves a
+# residual of about their weight over that of all edges, so it has to be far smaller than that.
+_SOLVED = 1e-10
 
 
 class ScalarLaplacian:

@@ -104,7 +104,7 @@ class Parts:
         order = np.lexsort((tries, cost, branch[tries]))
         at, best = np.unique(branch[tries[order]], return_index=True)
         chosen = order[best]
-        change, turn = np.full(len(node), np.inf), _identities(len(node))
+        change, turn = np.full(len(node), np.inf), rows.identities(len(node))
         change[at] = cost[chosen] - np.bincount(branch, weight * np.sqrt(angle), len(node))[at]
         turn[:, at] = stated[:, tries[chosen]]
         return Turns(node, change, turn)
@@ -170,7 +170,7 @@ class Parts:
 
     def turned(self, body_from_world: np.ndarray, turns: Turns, chosen: np.ndarray) -> np.ndarray:
         """The orientations ``(4, N)`` after the turns of the chosen branches ``(K,)``."""
-        turn = _identities(body_from_world.shape[1])
+        turn = rows.identities(body_from_world.shape[1])
         turn[:, turns.node[chosen]] = turns.turn[:, chosen]
         # Inner branches turn first, within the larger ones that they are in.
         for ancestor, _ in doublings(self.forest.parent):
@@ -217,10 +217,6 @@ def _joining(
     node, edge, inside = (np.concatenate(column) for column in zip(*found, strict=True))
     order = np.lexsort((edge, node))
     return node[order], edge[order], inside[order]
-
-
-def _identities(count: int) -> np.ndarray:
-    return np.tile(np.array([[0.0], [0.0], [0.0], [1.0]]), count)
 
 
 def _bounds(size: np.ndarray) -> list[int]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -53,6 +55,25 @@ def test_it_is_the_diagonal_of_the_least_squares_covariance(name: str) -> None:
     assert np.allclose(ratio, 1, atol=0.3 if name == "street" else 0.03)
 
 
+@pytest.mark.parametrize("score", [0.0, 0.9, 1.0])
+def test_what_hardly_joins_two_well_knit_parts_counts(score: float) -> None:
+    """Iterations that end early do not see how far parts may be apart, and state a hundredth of it."""
+    source, target = np.triu_indices(60, k=1)
+    ends = (np.concatenate((one, one + 60, joining)) for one, joining in ((source, [3, 5]), (target, [63, 65])))
+    graph = measured(random_truth(120, 2), *ends)
+    scores = torch.zeros(graph.num_edges, dtype=torch.float64)
+    scores[-2:] = score
+    angle = torch.full_like(scores, 0.03)
+    to = uncertainty.References(torch.zeros(120, dtype=torch.int64), torch.tensor([0]))
+    found = uncertainty.variances(graph, angle, scores, torch.zeros(0, dtype=torch.int64), to)
+    assert found is not None
+    weight = (1 - scores.numpy()).clip(1e-3)
+    noise = float((weight * 0.03**2).sum()) / (3 * (int((scores < 0.5).sum()) - 119))
+    ratio = (found.numpy()[1:] / (noise * _exact(graph, weight))) ** 0.5
+    assert np.allclose(ratio[:59], 1, atol=0.03)
+    assert np.allclose(ratio[59:], 1, atol=0.3)
+
+
 @pytest.mark.parametrize("name", _GRAPHS)
 def test_errors_over_draws_of_the_noise_are_as_stated(name: str) -> None:
     source, target = _GRAPHS[name]
@@ -88,7 +109,7 @@ def test_each_component_states_its_own() -> None:
 def test_well_knit_graphs_with_too_many_edges_state_none(monkeypatch: pytest.MonkeyPatch) -> None:
     graph = measured(random_truth(60, 7), *_GRAPHS["well knit"])
     assert bool(solve(graph, profile="sfm").uncertainty.isfinite().all())
-    monkeypatch.setattr(uncertainty, "_MOST_EDGES", 100)
+    monkeypatch.setattr(uncertainty, "PRIORS", replace(uncertainty.PRIORS, most_edges=100))
     assert bool(solve(graph, profile="sfm").uncertainty.isnan().all())
 
 
