@@ -109,12 +109,12 @@ class GrowingViewGraph:
         ends = self.node(*source), self.node(*target)
         if None in ends:
             return None
-        is_wanted = self._edge["kind"].view == EdgeKind.ODOMETRY
-        for name, node in zip(("source", "target"), ends, strict=True):
-            is_wanted &= self._edge[name].view == node
+        # One pass over all edges: after a restart a front end asks this of each edge of the graph that it repeats.
+        (rows,) = np.nonzero(self._edge["target"].view == ends[1])
+        is_wanted = (self._edge["source"].view[rows] == ends[0]) & (self._edge["kind"].view[rows] == EdgeKind.ODOMETRY)
         if not is_wanted.any():
             return None
-        x, y, z, w = self._edge["target_from_source"].view[int(is_wanted.argmax())].tolist()
+        x, y, z, w = self._edge["target_from_source"].view[rows[is_wanted.argmax()]].tolist()
         return (x, y, z, w)
 
     def robot_of(self, node: int) -> str:
