@@ -267,7 +267,7 @@ def _laid_on(graph: ViewGraph, known: SlamMemory, ration: float) -> Estimate | N
     most = min(_most_columns(linear, ration), _MOST - len(columns.edge))
     told = conditioned(linear, laid, growth, closure, columns, most)
     memory = replace(known, columns=told.columns)
-    return replace(_with_closures(estimate, told, linear, (kept, closure)), memory=memory)
+    return replace(_with_closures(estimate, told, (kept, closure)), memory=memory)
 
 
 def _linear(known: SlamMemory) -> Linear:
@@ -290,15 +290,12 @@ def _with_columns(graph: ViewGraph, known: SlamMemory) -> SlamMemory | None:
     return None if estimate is None else cast(SlamMemory, estimate.memory)
 
 
-def _with_closures(
-    estimate: Estimate, told: Conditioned, linear: Linear, edges: tuple[np.ndarray, np.ndarray]
-) -> Estimate:
+def _with_closures(estimate: Estimate, told: Conditioned, edges: tuple[np.ndarray, np.ndarray]) -> Estimate:
     """The estimate with further closures.
 
     Args:
         estimate: estimate on m edges.
         told: result for the n further closures.
-        linear: the linearisation behind it.
         edges: ``(m,)`` and ``(n,)`` numbers of both in the whole graph.
     """
     kept, closure = (torch.from_numpy(each) for each in edges)
@@ -311,15 +308,12 @@ def _with_closures(
 
     places = estimate.places
     if places is not None and laid.position is not None:
-        assert laid.graph.translation is not None
-        known = torch.isfinite(laid.graph.translation[closure]).all(dim=1).numpy()
-        weight = np.stack((np.ones(len(known)) / linear.noise.closure_turn, known / linear.noise.of_closures(0.0)), 1)
         places = replace(
             places,
             position=torch.from_numpy(laid.position),
             variance=torch.from_numpy(laid.variance[1]),
             rotation_score=merged(places.rotation_score, told.rotation_score),
-            precision=merged(places.precision, np.where((told.score > _FLAGGED)[:, None], 0.0, weight)),
+            precision=merged(places.precision, np.where((told.score > _FLAGGED)[:, None], 0.0, told.precision)),
         )
     score = merged(estimate.outlier_score, told.score)
     variance = torch.from_numpy(laid.variance[0])

@@ -67,12 +67,14 @@ class Conditioned:
     Attributes:
         laid: the answer after the good ones among them have moved it.
         score, rotation_score: ``(n,)`` probability that each closure is false, and that its rotation is.
+        precision: ``(n, 2)`` rad⁻² and m⁻² per component of each closure that is good; 0 for unknown translations.
         columns: columns of the closures that are included.
     """
 
     laid: LaidOn
     score: np.ndarray
     rotation_score: np.ndarray
+    precision: np.ndarray
     columns: Columns
 
 
@@ -110,7 +112,8 @@ def conditioned(
     apart = system.log_odds(system.residual[count:], system.independent(slice(count, None)), slice(count, None))
     score = expit(-np.append(odds, apart[0]))
     rotation_score = expit(-np.append(rotation_odds, apart[1]))
-    return Conditioned(system.moved(columns, given), score, np.minimum(score, rotation_score), columns)
+    precision = np.stack((1 / system.own[0], system.is_known / system.own[1]), axis=1)
+    return Conditioned(system.moved(columns, given), score, np.minimum(score, rotation_score), precision, columns)
 
 
 @dataclass(frozen=True)

@@ -126,6 +126,26 @@ def test_what_is_not_reckoned_in_yet_has_a_score_by_its_residual() -> None:
     assert (flagged == is_false[new]).mean() > 0.8
 
 
+def test_a_long_closure_counts_for_less_than_a_short_one() -> None:
+    """As in a whole solve, whose closures' translations err by a share of their length, too."""
+    graph, _ = drawn(translations=True, planar=True)
+    before = solve(first(graph, KNOWN), profile="slam")
+    memory = before.memory
+    assert isinstance(memory, SlamMemory) and memory.poses is not None
+    pose = memory.poses.pose
+    noise = replace(pose.state.noise, relative=0.1)
+    solved = replace(pose.solved, state=replace(pose.state, noise=noise))
+    poses = replace(memory.poses, pose=replace(pose, solved=solved))
+    memory = replace(memory, poses=poses, update_work=1e9)
+    found = solve(graph, profile="slam", warm_start=grown(graph, before), memory=memory, work=1e4)
+    is_new = (torch.arange(graph.num_edges) >= memory.graph.num_edges) & ~graph.is_odometry
+    good = is_new & (found.outlier_score < 0.5)
+    assert found.edge_precision is not None and graph.translation is not None
+    square = graph.translation[good].square().sum(dim=1).numpy()
+    assert square.max() > 4 * square.min() and len(square) > 5
+    np.testing.assert_allclose(1 / found.edge_precision[good, 1].numpy(), noise.of_closures(square))
+
+
 @pytest.mark.parametrize(
     ("number", "translations"), [(1, False), (5, True), pytest.param(1, True, marks=pytest.mark.large), (5, False)]
 )
