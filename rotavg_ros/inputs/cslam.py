@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from rotavg_ros.inputs.fields import Key, edge_id_of, target_from_source, to_nanoseconds, to_tuple, to_vector
-from rotavg_ros.inputs.foreign_graph import ForeignGraph, contradict
+from rotavg_ros.inputs.foreign_graph import ForeignGraph
 from rotavg_ros.inputs.records import EdgeRecord, Source
 from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason, quaternion
-from rotavg_ros.online.measurements import RejectedInputError, checked_rotation
+from rotavg_ros.online.measurements import RejectedInputError, checked_rotation, contradict
 from rotavg_ros.online.odometry.continuity import OdometrySample, has_jumped
 from rotavg_ros.view_graph import EdgeKind
 

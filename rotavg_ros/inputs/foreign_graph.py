@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 from rotavg_ros.inputs.fields import Key, edge_id_of, target_from_source, to_tuple, to_vector
 from rotavg_ros.inputs.records import EdgeRecord, Source
 from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason, quaternion
 from rotavg_ros.online.graph.fingerprints import Fingerprints
-from rotavg_ros.online.measurements import MAX_ID, RejectedInputError
+from rotavg_ros.online.measurements import MAX_ID, RejectedInputError, contradict
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.view_graph import EdgeKind
 
 # Most edges remembered as seen; beyond, they are forgotten, so that nonsense cannot fill the memory. The estimator
 # recognises repetitions as well, at a higher cost.
 _MOST_REMEMBERED = 1_000_000
-
-_LARGEST_REFINEMENT = math.radians(10.0)
 
 
 class ForeignGraph:
@@ -91,11 +88,6 @@ class ForeignGraph:
         # The sensor's position on the body is unknown, so its translation is taken for that of the body.
         position = quaternion.rotate(self._source.body_from_sensor, to_vector(translation))
         yield EdgeRecord(EdgeMeasurement(edge_id, source, target, inside, kind, precision, position))
-
-
-def contradict(known: Quaternion, repeated: Sequence[float]) -> bool:
-    """Whether two rotations of odometry between the same keyframes are not one and its refinement."""
-    return quaternion.angle_between(known, quaternion.normalize(repeated)) > _LARGEST_REFINEMENT
 
 
 def ends_of(source: KeyframeReference, target: KeyframeReference) -> tuple[Key, Key]:

@@ -20,6 +20,7 @@ OWN_EDGE_ID = MAX_ID
 # Stamps are signed 64-bit nanoseconds; negative ones are free to mean "unknown".
 MAX_STAMP_NS = 2**63 - 1
 UNKNOWN_STAMP_NS = -1
+_LARGEST_REFINEMENT = math.radians(10.0)
 
 
 class RejectReason(str, Enum):
@@ -172,6 +173,11 @@ def checked_rotation(xyzw: Sequence[float]) -> Quaternion:
         zero = length < UNIT_NORM_TOLERANCE
         raise RejectedInputError(RejectReason.ZERO_QUATERNION if zero else RejectReason.UNNORMALIZED_QUATERNION)
     return quaternion.normalize((x, y, z, w))
+
+
+def contradict(known: Quaternion, repeated: Sequence[float]) -> bool:
+    """Whether two rotations of odometry between the same keyframes are not one and its refinement."""
+    return quaternion.angle_between(known, quaternion.normalize(repeated)) > _LARGEST_REFINEMENT
 
 
 def check_length(numbers: Sequence[float] | None, length: int) -> None:

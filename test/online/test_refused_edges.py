@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online import EdgeMeasurement, KeyframeReference
+from rotavg_ros.view_graph import EdgeKind
 
 from .drives import OPTIONS, SECOND, at, closure, drive, feed, final, make
 
@@ -106,3 +107,25 @@ def test_retransmissions_are_dropped_and_repeated_measurements_kept(solver):
     assert reasons == [None, "duplicate_edge", None, None]
     waiting = replace(edge, target=KeyframeReference("r", 77))
     assert [estimator.add_edge(waiting), estimator.add_edge(waiting)] == [None, "duplicate_edge"]
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 3.0, 30.0])
+@pytest.mark.parametrize("chosen_by", ["edges", "odometry"])
+def test_a_front_end_that_counts_from_zero_again_is_told_by_its_odometry(solver, turned_deg, chosen_by):
+    """Elsewhere ids are the node's own, and further odometry between its keyframes may well tell of a slip."""
+    run, estimator = drive(), make(solver, replace(OPTIONS, keyframe_source=chosen_by))
+    if chosen_by == "odometry":
+        feed(estimator, run, stop=7)
+
+    def step(number: int, turn: Rotation, edge_id: int = 0) -> EdgeMeasurement:
+        ends = KeyframeReference("r", number), KeyframeReference("r", number + 1)
+        return EdgeMeasurement(edge_id, *ends, turn.as_quat(), EdgeKind.ODOMETRY)
+
+    turns = [Rotation.from_rotvec([0.1 * number, 0.2, 0.0]) for number in range(2)]
+    assert [estimator.add_edge(step(number, turn)) for number, turn in enumerate(turns)] == [None, None]
+    edges = estimator.counts().edges
+    again = step(0, turns[0] * Rotation.from_euler("z", turned_deg, degrees=True), edge_id=1)
+    is_refused = chosen_by == "edges" and turned_deg > 10
+    assert estimator.add_edge(again) == ("contradictory_odometry" if is_refused else None)
+    assert estimator.counts().rejected == ({"contradictory_odometry": 1} if is_refused else {})
+    assert estimator.counts().edges == edges + (not is_refused)

@@ -16,6 +16,7 @@ from rotavg_ros.online.measurements import (
     RejectedInputError,
     RejectReason,
     checked_edge,
+    contradict,
 )
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
@@ -36,6 +37,7 @@ class EdgePlacement:
             if is_known or edge in growth.pending:
                 self._complete_stamps(edge)
                 raise RejectedInputError(RejectReason.DUPLICATE_EDGE)
+            self._check_repeated_odometry(edge)
             if not growth.has_room_for_edge():
                 return growth.give_up(edge, RejectReason.GRAPH_FULL)
             if undecided is not None:
@@ -87,6 +89,21 @@ class EdgePlacement:
         if labelled + waiting:
             growth.labels[source_robot, edge_id] = label
         return labelled + waiting
+
+    def _check_repeated_odometry(self, edge: EdgeMeasurement) -> None:
+        """Refuse odometry of a front end that has begun anew and uses the same ids for other places.
+
+        Raises:
+            RejectedInputError: the graph has very different odometry between these keyframes.
+        """
+        source, target = edge.source, edge.target
+        chosen_by_front_end = self._growth.options.keyframe_source == "edges" and edge.kind == EdgeKind.ODOMETRY
+        if not chosen_by_front_end or source.keyframe_id is None or target.keyframe_id is None:
+            return
+        ends = (source.robot, source.keyframe_id), (target.robot, target.keyframe_id)
+        known = self._growth.graph.odometry_between(*ends)
+        if known is not None and contradict(known, edge.target_from_source):
+            raise RejectedInputError(RejectReason.CONTRADICTORY_ODOMETRY)
 
     def _undecided_end(self, edge: EdgeMeasurement) -> KeyframeReference | None:
         """The first end whose stamp matters and may belong to either of two time lines."""
