@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rotavg_ros.online.answer.answer import Answer
+from rotavg_ros.online.answer.closure_filter import closure_keys
 from rotavg_ros.online.answer.odometry_frame import OdometryFrame, placed_frames
 from rotavg_ros.online.answer.trajectory import Trajectory, corrected_trajectories
 from rotavg_ros.online.content import Content, Counts
@@ -200,6 +204,12 @@ class OnlineEstimator:
         """The graph now. Until keyframes are marginalised a later one begins with the same keyframes and edges."""
         with self._lock:
             return self._content.builder.graph.snapshot()
+
+    def closure_keys(self) -> NDArray[np.uint64]:
+        """Names of the closures in the graph, and of edges that wait to enter it, see :func:`closure_keys`."""
+        with self._lock:
+            snapshot, pending = self._content.builder.graph.snapshot(), list(self._content.state.growth.pending)
+        return closure_keys(snapshot, pending)
 
     @property
     def revision(self) -> int:

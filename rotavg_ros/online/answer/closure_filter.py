@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Generic, TypeVar
@@ -11,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rotavg_ros.online.answer.answer import Answer
-from rotavg_ros.online.measurements import MAX_ID
+from rotavg_ros.online.graph.snapshot import GraphSnapshot
+from rotavg_ros.online.measurements import MAX_ID, EdgeMeasurement
 from rotavg_ros.view_graph import EdgeKind
 
 # A sender's name for an edge: the source's robot, and the edge's id.
@@ -87,6 +89,12 @@ class ClosureFilter(Generic[_Item]):
         waiting.items.append(item)
         waiting.measurements.add(measurement)
 
+    def forget_all_but(self, keys: NDArray[np.uint64]) -> None:
+        """Forget the closures that wait and have none of these :func:`closure_keys`: no answer will tell of them."""
+        waiting = np.fromiter(self._waiting, dtype=np.uint64, count=len(self._waiting))
+        for key in waiting[~np.isin(waiting, keys)].tolist():
+            del self._waiting[key]
+
     def waits(self, name: EdgeName, measurement: int) -> bool:
         """Whether this very measurement waits."""
         waiting = self._waiting.get(_key(name))
@@ -152,13 +160,29 @@ class ClosureFilter(Generic[_Item]):
         return _joined(revoked), _joined(reinstated)
 
 
+def closure_keys(snapshot: GraphSnapshot, pending: Iterable[EdgeMeasurement]) -> NDArray[np.uint64]:
+    """Names, as numbers, of the closures in a graph, and of the edges that wait to enter it."""
+    graph = snapshot.graph
+    rows, source = np.flatnonzero((graph.kind == EdgeKind.LOOP_CLOSURE).numpy()), graph.source.numpy()
+    inside = _keys_of(rows, snapshot.edge_id, source, snapshot)
+    waiting = [_key((edge.source.robot, edge.edge_id)) for edge in pending]
+    return np.append(inside, np.array(waiting, dtype=np.uint64))
+
+
 def _closures(answer: Answer) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
     """Rows of the closures that were part of the answer's solve, and their names as numbers."""
     rows = np.flatnonzero((answer.kind == EdgeKind.LOOP_CLOSURE) & ~answer.waits)
-    robot_keys = np.array([_robot_key(robot) for robot in answer.robots], dtype=np.uint64)
+    return rows, _keys_of(rows, answer.edge_id, answer.source, answer)
+
+
+def _keys_of(
+    rows: NDArray[np.int64], edge_id: NDArray[np.uint64], source: NDArray[np.int64], keyframes: Answer | GraphSnapshot
+) -> NDArray[np.uint64]:
+    """``(n,)`` names of some edges, as numbers."""
+    robot_keys = np.array([_robot_key(robot) for robot in keyframes.robots], dtype=np.uint64)
     if not len(rows):
-        return rows, np.empty(0, dtype=np.uint64)
-    return rows, answer.edge_id[rows] ^ robot_keys[answer.keyframe_robot[answer.source[rows]]]
+        return np.empty(0, dtype=np.uint64)
+    return edge_id[rows] ^ robot_keys[keyframes.keyframe_robot[source[rows]]]
 
 
 def _found(keys: NDArray[np.uint64], unique: NDArray[np.uint64]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rotavg_ros.online import EdgeMeasurement, KeyframeReference
 from rotavg_ros.online.answer import closure_filter
 from rotavg_ros.online.answer.closure_filter import ClosureFilter
 from rotavg_ros.view_graph import EdgeKind
+
+from ..drives import OPTIONS, closure, drive, feed, make
 
 
 def answer(verdicts: list[tuple[str, int, bool]], odometry: int = 3) -> SimpleNamespace:
@@ -82,6 +86,21 @@ def test_who_turns_out_false_is_revoked_and_may_be_reinstated():
     # What the graph has dropped is not revoked.
     assert closures.decide(answer([("a", 1, False)]), 0.0, 0.0).revoked.tolist() == []
     assert closures.decide(answer([], odometry=0), 0.0, 0.0).revoked.tolist() == []
+
+
+def test_what_the_estimator_no_longer_has_does_not_wait(solver):
+    """An edge may wait for a keyframe that does not come, and is then refused."""
+    run, estimator = drive(), make(solver, replace(OPTIONS, pending_timeout_s=2.0))
+    closures: ClosureFilter[str] = ClosureFilter()
+    waiting = EdgeMeasurement(2, KeyframeReference("r", 0), KeyframeReference("r", 99), (0, 0, 0, 1))
+    feed(estimator, run, stop=10)
+    for edge in (closure(run, 1, 0, 9), waiting):
+        assert estimator.add_edge(edge) is None
+        closures.take(("r", edge.edge_id), "", now=0.0)
+    for stop, left in ((25, [1, 2]), (40, [1])):
+        feed(estimator, run, start=stop - 15, stop=stop)
+        closures.forget_all_but(estimator.closure_keys())
+        assert [edge_id for edge_id in (1, 2) if closures.knows(("r", edge_id))] == left and len(closures) == len(left)
 
 
 def test_measurements_of_one_name_go_together():

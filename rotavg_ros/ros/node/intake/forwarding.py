@@ -279,6 +279,8 @@ class Forwarding:
             if len(rows):
                 self._verdicts[name].publish(flags_message(answer, self._frame_id, rows))
         forward.send(decision.passed)
+        if len(forward.filter):
+            forward.filter.forget_all_but(self._estimator.closure_keys())
 
     def _forget_with_the_estimator(self) -> None:
         if self._generation != self._estimator.generation:

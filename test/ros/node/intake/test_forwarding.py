@@ -79,7 +79,7 @@ def test_believed_closures_go_on_as_they_came_and_are_revoked_and_reinstated(liv
     passed = listen(live_node, RelativeRotation, "/trusted")
     revoked = listen(live_node, OutlierFlags, "/rotavg/revoked")
     reinstated = listen(live_node, OutlierFlags, "/rotavg/reinstated")
-    start(live_node, "forward_topics:=['relative_rotations:trusted']")
+    start(live_node, "forward_topics:=['relative_rotations:trusted']", f"pending_timeout_s:={LENGTH}.0")
     until_heard(live_node, passed, live_node.edges.publish)
     sent = [closure(edge_id, edge_id in FALSE) for edge_id in range(10)]
     for edge in [*sent, *sent]:  # a sender may repeat itself
@@ -92,6 +92,13 @@ def test_believed_closures_go_on_as_they_came_and_are_revoked_and_reinstated(liv
     assert {edge.id for edge in passed} == {99, *range(10)} - FALSE and len(passed) == 8
     by_id = {edge.id: edge for edge in [*sent, step]}
     assert all(edge == by_id[edge.id] for edge in passed)
+    # One that waits for a keyframe in vain is no longer held back.
+    lost = closure(50, False)
+    lost.target = KeyframeReference(by=KeyframeReference.BY_ID, id=9999)
+    live_node.edges.publish(lost)
+    live_node.spin_until(lambda: live_node.status["held back"] == str(len(FALSE) + 1))
+    live_node.turn(LENGTH, 2 * LENGTH + 2)
+    live_node.spin_until(lambda: live_node.status["held back"] == str(len(FALSE)))
     in_order = [edge.id for edge in passed if edge.id != 99]
     assert in_order == sorted(in_order)
     assert not revoked and not reinstated
