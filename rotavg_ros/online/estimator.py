@@ -139,8 +139,14 @@ class OnlineEstimator:
         with self._lock:
             self._content.state.growth.refuse(reason)
 
-    def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
+    def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel, to_come: int = 0) -> int:
         """Accept or reject for good every edge with a sender's id, or hand it back; returns how many there are.
+
+        Args:
+            source_robot: of the edge's source.
+            edge_id: the sender's.
+            label: what holds from now on.
+            to_come: how many such edges the caller has, but has not added yet.
 
         Raises:
             ViewGraphError: not an :class:`EdgeLabel`; a file with such a label could never be loaded.
@@ -153,7 +159,7 @@ class OnlineEstimator:
         if not 0 <= edge_id <= MAX_ID:
             return 0
         with self._lock:
-            return self._content.builder.label_edge(source_robot, edge_id, label)
+            return self._content.builder.label_edge(source_robot, edge_id, label, to_come)
 
     def current_orientation(self, robot: str) -> Quaternion | None:
         """world_from_body now: the robot's last corrected keyframe, then odometry. None before its first odometry."""

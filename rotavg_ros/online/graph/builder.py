@@ -127,9 +127,9 @@ class GraphBuilder:
         """Take an edge into the graph or into the waiting room; returns why it was refused, if it was."""
         return self._edges.add(edge)
 
-    def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
-        """Label all edges with this sender's id, waiting ones and later repetitions included; returns how many."""
-        return self._edges.label(source_robot, edge_id, label)
+    def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel, to_come: int = 0) -> int:
+        """Label all edges with this sender's id, see :meth:`EdgePlacement.label`."""
+        return self._edges.label(source_robot, edge_id, label, to_come)
 
     def settle(self) -> None:
         """No more input is expected for now: tie edges slightly ahead of the odometry to its end."""

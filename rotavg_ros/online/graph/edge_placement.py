@@ -81,14 +81,18 @@ class EdgePlacement:
             horizon_ns = track.latest.stamp_ns + growth.options.odometry_bounds.tolerance_ns
             self.place_all(growth.pending.pop_until(robot, horizon_ns), settle=True)
 
-    def label(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
-        """Label all edges with this sender's id, waiting ones and later repetitions included; returns how many."""
+    def label(self, source_robot: str, edge_id: int, label: EdgeLabel, to_come: int = 0) -> int:
+        """Label all edges with this sender's id, waiting ones and later repetitions included; returns how many.
+
+        ``to_come`` of them are known not to have been added yet.
+        """
         growth = self._growth
         waiting = sum(edge.edge_id == edge_id and edge.source.robot == source_robot for edge in growth.pending)
         labelled = growth.graph.label_edges(source_robot, edge_id, label) if edge_id != OWN_EDGE_ID else 0
-        if labelled + waiting:
+        found = labelled + waiting + to_come
+        if found:
             growth.labels[source_robot, edge_id] = label
-        return labelled + waiting
+        return found
 
     def _check_repeated_odometry(self, edge: EdgeMeasurement) -> None:
         """Refuse odometry of a front end that has begun anew and uses the same ids for other places.

@@ -74,7 +74,7 @@ class RotavgNode(parameter_server.ParameterNode):
         self._solving = Solving(self, self._estimator, self._health, self._outputs, self._forwarding, parameters)
         self._solving.tick_budget_s = parameters.tick_budget_s
         workers = Workers(solver=self._worker, saver=self._saver)
-        Services(self, self._estimator, self._solving, workers, parameters.robots[0])
+        Services(self, listening.label_edge, self._solving, workers, parameters.robots[0])
         self._worker.submit(thinning.load)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # ticks even if /clock is paused or absent

@@ -10,7 +10,6 @@ from rclpy.node import Node
 from rotavg_msgs.srv import LabelEdge
 from std_srvs.srv import SetBool, Trigger
 
-from rotavg_ros.online import OnlineEstimator
 from rotavg_ros.ros.node.solving import Solving
 from rotavg_ros.ros.node.worker import Worker, Workers
 from rotavg_ros.view_graph import EdgeLabel
@@ -22,12 +21,12 @@ class Services:
     def __init__(
         self,
         node: Node,
-        estimator: OnlineEstimator,
+        label_edge: Callable[[str, int, EdgeLabel], int],
         solving: Solving,
         workers: Workers,
         default_robot: str,
     ) -> None:
-        self._estimator = estimator
+        self._label_edge = label_edge
         self._solving = solving
         self._workers = workers
         self._default_robot = default_robot
@@ -77,7 +76,7 @@ class Services:
         except ValueError:
             response.success, response.message = False, f"label {request.label} is none of 0, 1, 2"
             return response
-        number = self._estimator.label_edge(robot, request.edge_id, label)
+        number = self._label_edge(robot, request.edge_id, label)
         response.success = number > 0
         edges = f"edge {request.edge_id} of {robot}"
         response.message = f"{edges}: {label.name.lower()} ({number} found)" if number else f"{edges} is not known"

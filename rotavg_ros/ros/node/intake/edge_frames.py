@@ -77,6 +77,10 @@ class EdgeFrames:
         """Number of edges that wait."""
         return len(self._waiting)
 
+    def count(self, source_robot: str, edge_id: int) -> int:
+        """How many edges with a sender's id wait."""
+        return sum(each.edge.edge_id == edge_id and each.edge.source.robot == source_robot for each in self._waiting)
+
     def note_transforms(self, message: Any) -> None:
         """Remember transforms between frames (:meth:`SensorFrames.take`), and check the edges that waited for them."""
         self._sensors.take(message)

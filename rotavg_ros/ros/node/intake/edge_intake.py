@@ -17,6 +17,7 @@ from rotavg_ros.ros.node.intake.edge_frames import EdgeFrames
 from rotavg_ros.ros.node.intake.forwarding import Forwarding
 from rotavg_ros.ros.node.intake.wiring import Input
 from rotavg_ros.ros.node.message_counting import TopicCounter
+from rotavg_ros.view_graph import EdgeLabel
 
 _SLICE_S = 0.005
 _BREAK_S = 0.001
@@ -85,6 +86,11 @@ class EdgeIntake:
         self._under_way.append((topic, counter, records))
         self._take_some()
 
+    def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
+        """As :meth:`OnlineEstimator.label_edge`, edges that wait for their sensor's mounting included."""
+        self._forget_with_the_estimator()
+        return self._estimator.label_edge(source_robot, edge_id, label, self.frames.count(source_robot, edge_id))
+
     def _go_on(self) -> None:
         self._forget_with_the_estimator()
         self._take_some()
@@ -110,7 +116,7 @@ class EdgeIntake:
 
     def _take(self, record: EdgeRecord | EdgeVerdict, topic: Input, counter: TopicCounter) -> None:
         if isinstance(record, EdgeVerdict):
-            self._estimator.label_edge(record.source_robot, record.edge_id, record.label)
+            self.label_edge(record.source_robot, record.edge_id, record.label)
             return
         topic.note_frames(record.frame_id)
         counter.by_sequence.observe(record.sender, record.sequence)

@@ -28,6 +28,7 @@ from rotavg_ros.ros.node.message_counting import TopicCounter
 from rotavg_ros.ros.node.output.outputs import Outputs
 from rotavg_ros.ros.node.topics import overrides, user_error_about
 from rotavg_ros.settings.parameters import NodeParameters
+from rotavg_ros.view_graph import EdgeLabel
 
 _LOG_PERIOD_S = 5.0
 
@@ -88,6 +89,10 @@ class Subscriptions:
     def waiting_for_frames(self) -> int:
         """Number of edges that wait for the transform between their frame and the body's."""
         return self._intake.frames.waiting
+
+    def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
+        """See :meth:`EdgeIntake.label_edge`."""
+        return self._intake.label_edge(source_robot, edge_id, label)
 
     def _full_name(self, topic: str) -> str:
         """The topic's name with the namespace and remappings.

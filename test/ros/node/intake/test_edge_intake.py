@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -10,13 +11,15 @@ import pytest
 rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
+from std_msgs.msg import Empty
 
 from rotavg_ros.inputs import EdgeRecord
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
-from rotavg_ros.ros.node.intake import edge_intake
+from rotavg_ros.ros.node.intake import edge_frames, edge_intake
 from rotavg_ros.ros.node.intake.edge_intake import EdgeIntake
 from rotavg_ros.ros.node.intake.wiring import Input
 from rotavg_ros.ros.node.message_counting import TopicCounter
+from rotavg_ros.view_graph import EdgeLabel
 
 LENGTH = 3000
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
@@ -128,3 +131,21 @@ def test_converters_are_told_what_was_given_up(executor: SingleThreadedExecutor)
     for _ in range(2):
         intake.take(topic, TopicCounter(), convert(("r", 0)))
     assert convert.given_up == [(KeyframeReference("r", 2), KeyframeReference("r", 3))]
+
+
+def test_an_edge_that_waits_for_its_sensors_mounting_can_be_labelled(
+    executor: SingleThreadedExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(edge_frames, "_tf_message", lambda: Empty)
+    online = OnlineEstimator(EstimatorOptions(keyframe_source="edges"), lambda *_, **__: None)
+    intake = EdgeIntake(executor.get_nodes()[0], online, SimpleNamespace(), lambda reason: None, frame_wait_s=1000.0)
+    topic = Input("/edges", "any", "edge_topics", "", QoSProfile(depth=1))
+    records = [replace(record, frame_id="camera") for record in Chain()(("r", 2))]
+    intake.take(topic, TopicCounter(), iter(records))
+    assert intake.frames.waiting == 2 and online.counts().edges == 0
+    found = [intake.label_edge(robot, edge_id, EdgeLabel.REJECTED) for robot in "rs" for edge_id in (1, 2)]
+    assert found == [1, 0, 0, 0]
+    for record in records:
+        online.add_edge(record.edge)
+    assert online.snapshot().graph.label.tolist() == [EdgeLabel.AUTOMATIC, EdgeLabel.REJECTED]
+    assert intake.label_edge("r", 1, EdgeLabel.ACCEPTED) == 2
