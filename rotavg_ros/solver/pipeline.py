@@ -113,7 +113,7 @@ def solve(
         _root_at_identity(estimate.body_from_world.cpu(), job.component),
         score,
         job.component,
-        estimate.variance.cpu().double().sqrt(),
+        estimate.variance.cpu().double().sqrt().masked_fill(_is_alone(job.component), 0.0),
         run.watch.seconds,
         method,
         profile,
@@ -274,6 +274,11 @@ def _root_at_origin(position: Tensor, body_from_world: Tensor, component: Tensor
     """Positions ``(N, 3)`` in the frame of each component's first node."""
     first = _first_nodes(component)
     return rotations.rotate(body_from_world[first][component], position - position[first][component])
+
+
+def _is_alone(component: Tensor) -> Tensor:
+    """``(N,)`` bool, nodes without edges. Such a node is what its orientation is stated relative to."""
+    return (torch.bincount(component) == 1)[component]
 
 
 def _first_nodes(component: Tensor) -> Tensor:

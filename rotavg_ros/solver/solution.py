@@ -24,7 +24,7 @@ class Solution:
             where ``position`` is known, that its translation errs by more than 2 m.
         component: ``(N,)`` int64, connected component, numbered by first node.
         uncertainty: ``(N,)`` float64 radians, standard deviation of each component of the orientation error relative
-            to the component's first node; NaN where the method gives none.
+            to the component's first node, so 0 for a node without edges; NaN where the method gives none.
         stage_seconds: wall-clock seconds of each stage that ran.
         method, profile, device: what was run, with "auto" resolved.
         memory: makes the next solve of the same graph, grown a little, cheaper; pass it on unchanged. None if there is

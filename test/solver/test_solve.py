@@ -268,3 +268,14 @@ def test_the_stated_uncertainty_is_that_of_repeated_runs() -> None:
     ratio = (torch.stack(squares).mean(0)[1:] / torch.stack(stated).mean(0)[1:]).sqrt()
     assert 0.8 < float(ratio.median()) < 1.2
     assert float(ratio.min()) > 0.5 and float(ratio.max()) < 2
+
+
+@pytest.mark.parametrize("profile", ["slam", "sfm"])
+@pytest.mark.parametrize("method", ["neurora", "spt", "chatterjee"])
+@pytest.mark.parametrize("num_edges", [0, 3, 4])
+def test_a_node_without_edges_is_certain_relative_to_itself(profile: str, method: str, num_edges: int) -> None:
+    """It is its component's first node, whatever the method states of others, and whatever the rest of the graph is."""
+    source, target = torch.tensor([0, 1, 2, 0])[:num_edges], torch.tensor([1, 2, 3, 3])[:num_edges]
+    kind = torch.tensor([0, 0, 0, 1])[:num_edges]
+    graph = ViewGraph.create(source, target, rotations.identity(num_edges), num_nodes=6, kind=kind)
+    assert solve(graph, profile=profile, method=method).uncertainty[4:].tolist() == [0.0, 0.0]
