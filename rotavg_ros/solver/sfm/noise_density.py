@@ -7,7 +7,8 @@ accuracy. So each component uses the density of highest likelihood, with false e
     p(r) = π c_β s⁻³ exp(−(r/s)^β) + (1 − π) / (8 π²),     β of ½, ¾, 1, 1½, 2,     c_β = β / (4π Γ(3/β)).
 
 An edge then has weight w = P(good | r) β r^(β−2) / s^β, with which least-squares steps lead to the maximum (expectation
-and maximisation). β stays ½, and nothing changes, unless another value is clearly likelier.
+and maximisation). β stays ½, and nothing changes, unless another value is clearly likelier. It stays ½ as well where
+good edges err less than the steps before resolve: such residuals say where these ended, and not how errors are spread.
 """
 
 from __future__ import annotations
@@ -90,7 +91,9 @@ class NoiseDensity:
         # log(π p + (1 − π) even) is the logarithm of the second term plus the softplus of the log-odds.
         likelihood = sums(torch.nn.functional.softplus(log_odds)) + number * ((1 - good).log() + even)
         likeliest = likelihood.max(dim=0)
-        is_other = likeliest.values > likelihood[0] + priors.ahead
+        # The length that good edges have under each density, in rad: E (r/s)^β = 3/β.
+        typical = (log_scale + (3 / exponent).log() / exponent - log_volume / 3).gather(0, likeliest.indices[None])[0]
+        is_other = (likeliest.values > likelihood[0] + priors.ahead) & (typical >= math.log(priors.least_length))
         which = torch.where(is_other, likeliest.indices, 0)[None]
         of_chosen = likelihood.gather(0, which)[0]
         chosen = [of_all.gather(0, which)[0] for of_all in (log_scale.exp(), good)]

@@ -168,6 +168,8 @@ class DensityPriors:
     Attributes:
         exponents: values of β; the first is that of the steps before.
         ahead: nats by which another exponent has to be likelier.
+        least_length: rad; where good edges err less, the exponent stays. The steps before end once they turn no camera
+            by more than this (``RefinementPriors.converged_angle``).
         good_share: initial share of good edges.
         most_certain: one over the least share of false edges, numerical.
         rounds: number of rounds of expectation and maximisation.
@@ -177,6 +179,7 @@ class DensityPriors:
 
     exponents: tuple[float, ...] = (0.5, 0.75, 1.0, 1.5, 2.0)
     ahead: float = 10.0
+    least_length: float = float(np.radians(0.001))
     good_share: float = 0.8
     most_certain: float = 1e3
     rounds: int = 20

@@ -106,6 +106,18 @@ def test_normal_noise_is_averaged_by_squares(false_share: float) -> None:
     assert np.mean(ratios) < 0.9
 
 
+def test_exact_edges_tell_of_no_density() -> None:
+    """Their residuals say where steps ended; in a density of these, all edges are false after the next step."""
+    rng = np.random.default_rng(13)
+    source, target = np.triu_indices(40, k=1)
+    kept = rng.random(len(source)) < 0.4
+    source, target = source[kept], target[kept]
+    false = rng.random(len(source)) < 0.4
+    noise = np.where(false[:, None], Rotation.random(len(source), rng).as_quat(), [0, 0, 0, 1])
+    truth = random_truth(40, 13)
+    assert errors_deg(measured(truth, source, target, Rotation.from_quat(noise)), truth, "neurora") < 1e-3
+
+
 @pytest.mark.parametrize("recipe", [ReleasedRecipe(cameras=(150, 200)), PaperRecipe(cameras=(150, 200))])
 def test_where_half_is_right_nothing_changes(recipe: ReleasedRecipe | PaperRecipe) -> None:
     graph = recipe.sample(np.random.default_rng(7)).graph
