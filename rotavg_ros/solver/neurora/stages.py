@@ -37,9 +37,13 @@ def trust_all(graph: ViewGraph) -> Cleaned:
 
 def apply_labels(cleaned: Cleaned, label: Tensor) -> Cleaned:
     """Verdicts from outside override the network's."""
-    probability = torch.where(label == EdgeLabel.ACCEPTED, 0.0, cleaned.outlier_probability)
-    probability = torch.where(label == EdgeLabel.REJECTED, 1.0, probability)
-    return replace(cleaned, outlier_probability=probability)
+    return replace(cleaned, outlier_probability=labelled(cleaned.outlier_probability, label))
+
+
+def labelled(probability: Tensor, label: Tensor) -> Tensor:
+    """Probabilities ``(M,)`` that edges are false, overridden by labels ``(M,)``."""
+    probability = torch.where(label == EdgeLabel.ACCEPTED, 0.0, probability)
+    return torch.where(label == EdgeLabel.REJECTED, 1.0, probability)
 
 
 @torch.no_grad()

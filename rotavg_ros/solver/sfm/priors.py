@@ -249,7 +249,7 @@ class UncertaintyPriors:
         samples: number of random samples; what is sampled of a standard deviation errs by 9 %.
         most_edges: with more edges in well-knit components, samples would take seconds, and none is stated.
         least_weight: weight of edges that are surely wrong, which keeps the graph connected.
-        flagged: edges of lower scores count as checks of each other.
+        flagged: edges of lower scores are believed: the noise's variance is from their residuals.
         least_noise: rad², floor of the noise's variance, numerical, for graphs without any.
     """
 

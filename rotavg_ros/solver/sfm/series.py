@@ -97,28 +97,6 @@ class EdgesInSeries(NamedTuple):
         together, spread = self.sums(angle.double()), self.sums(uncertainty.double().square()).sqrt()
         return self.blame * residual_probability(together, spread, outlier_angle)[self.group]
 
-    def bridge_score(self, score: Tensor, of_edge: Tensor, num_components: int) -> Tensor:
-        """Probability ``(B,)`` that a bridge is wrong, from the same arguments as :meth:`false_share`.
-
-        Orientations follow a bridge, so its residual says nothing about it.
-        """
-        return self.false_share(score, of_edge, num_components)[of_edge[self.bridge]]
-
-    def false_share(self, score: Tensor, of_edge: Tensor, num_components: int) -> Tensor:
-        """Share ``(C,)`` of false edges: the mean score of each component's checked edges and a good one.
-
-        Args:
-            score: ``(M,)`` scores of the edges that others check.
-            of_edge: ``(M,)`` each edge's component.
-            num_components: number of components.
-        """
-        checked = torch.ones_like(score)
-        checked[self.bridge] = 0
-        wrong, count = (
-            score.new_zeros(num_components).index_add_(0, of_edge, value) for value in (checked * score, checked)
-        )
-        return wrong / (count + 1)
-
     def sums(self, value: Tensor) -> Tensor:
         """Sums ``(G,)`` of values ``(K,)`` by class."""
         return value.new_zeros(self.num_groups).index_add_(0, self.group, value)

@@ -20,7 +20,7 @@ from rotavg_ros.solver.neurora.fine_net import FineNet
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.neurora.paper import PaperCleanNet, PaperFineNet, paper_fine_tune
 from rotavg_ros.solver.neurora.scores import residual_and_uncertainty, residual_probability
-from rotavg_ros.solver.neurora.stages import apply_labels, clean, fine_tune, trust_all
+from rotavg_ros.solver.neurora.stages import apply_labels, clean, fine_tune, labelled, trust_all
 from rotavg_ros.solver.neurora.tiled.tuning import tune
 from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap, breadth_first
 from rotavg_ros.solver.sfm.certainty.attachment import PRIORS as ATTACHMENT
@@ -96,13 +96,13 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     if steps > 0 or by_residuals:
         # A tree alone leaves no residuals to judge by. Now a residual is the edge's noise, up to the orientations'
         # error. With the paper's CleanNet, its own scores stand unless the orientations are refined.
-        angle, score, attached = answer.scored or _scored(cleared, answer)
+        score, noise, attached = answer.scored or _scored(cleared, answer)
         if steps > 0:
             with watch.stage("uncertainty"):
                 to = References(component, form.first_nodes())
                 if attached is not None:
                     score = torch.from_numpy(attached.scores(score.cpu().numpy())).to(score)
-                stated = variances(graph, angle, score, cleared.structure.series.bridge, to)
+                stated = variances(graph, noise, score, cleared.structure.series.bridge, to)
                 if stated is not None and attached is not None:
                     turned = attached.variances(to.node[component].cpu().numpy())
                     stated = stated + torch.from_numpy(turned).to(stated)
@@ -134,13 +134,13 @@ class _Scored(NamedTuple):
     """What follows from an answer.
 
     Attributes:
-        angle: ``(M,)`` rad, residuals.
         score: ``(M,)`` probability that an edge is false, from its residual.
+        noise: ``(C,)`` rad², variance of good edges' errors, per axis.
         attached: how surely parts that few edges join are attached; None: not known.
     """
 
-    angle: Tensor
     score: Tensor
+    noise: Tensor
     attached: Attachment | None
 
 
@@ -228,13 +228,25 @@ def _scored(cleared: _Cleared, answer: _Answer) -> _Scored:
     score = residual_probability(angle, spread, NUMBERS.outlier_angle)
     score[series.edge] = series.score(angle[series.edge], spread[series.edge], NUMBERS.outlier_angle)
     of_edge = component[graph.source]
-    score[series.bridge] = series.bridge_score(score, of_edge, len(structure.roots))
+    # Orientations follow a bridge, so its residual says nothing about it; labels say nothing about other edges.
+    is_told = graph.label == EdgeLabel.AUTOMATIC
+    is_told[series.bridge] = False
+    share = _false_share(score[is_told], of_edge[is_told], len(structure.roots))
+    score[series.bridge] = share[of_edge[series.bridge]]
+    score = labelled(score, graph.label)
+    noise = noise_variance(graph, angle, score, component)
     if answer.parts is None:
-        return _Scored(angle, score, None)
-    share = series.false_share(score, of_edge, len(structure.roots))
-    noise = noise_variance(graph, angle, score, component)[structure.roots].sqrt()
-    density = ErrorDensity.of(*(one.cpu().numpy() for one in (angle.double(), score, of_edge, share, noise)))
-    return _Scored(angle, score, Attachment.of(answer.parts, _rows(answer.body_from_world), density))
+        return _Scored(score, noise, None)
+    density = ErrorDensity.of(*(one.cpu().numpy() for one in (angle.double(), score, of_edge, share, noise.sqrt())))
+    return _Scored(score, noise, Attachment.of(answer.parts, _rows(answer.body_from_world), density))
+
+
+def _false_share(score: Tensor, of_edge: Tensor, num_components: int) -> Tensor:
+    """Share ``(C,)`` of false edges: the mean score of some edges ``(K,)`` of each component, and of a good one."""
+    wrong, count = (
+        score.new_zeros(num_components).index_add_(0, of_edge, value) for value in (score, torch.ones_like(score))
+    )
+    return wrong / (count + 1)
 
 
 def _rows(body_from_world: Tensor) -> np.ndarray:
@@ -245,7 +257,7 @@ def _rows(body_from_world: Tensor) -> np.ndarray:
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:
     """The graph's connections; among edges in series, CleanNet's scores say which is to blame, as far as reliable."""
     graph = begun.cleaned.measured
-    series = EdgesInSeries.of(graph, begun.parent, begun.parent_edge)
+    series = _in_series(graph, begun)
     structure = Structure(component, begun.roots, begun.cleaned.edges, series)
     redundancy = structure.redundancy(graph)
     # In a component with a single cycle, CleanNet has no evidence to tell its edges apart.
@@ -254,3 +266,12 @@ def _structure(begun: Bootstrapped, component: Tensor) -> Structure:
     log_odds = begun.cleaned.outlier_probability[series.edge].double().logit()
     log_odds = trust * log_odds.clamp(-NUMBERS.max_logit, NUMBERS.max_logit)
     return replace(structure, series=series.blamed(log_odds))
+
+
+def _in_series(graph: ViewGraph, begun: Bootstrapped) -> EdgesInSeries:
+    """Edges in series, and bridges; edges that the user has rejected are neither, and check none."""
+    allowed = (graph.label != EdgeLabel.REJECTED).nonzero()[:, 0]
+    if len(allowed) == graph.num_edges:
+        return EdgesInSeries.of(graph, begun.parent, begun.parent_edge)
+    series = Structure.of(graph.select_edges(allowed)).series
+    return series._replace(edge=allowed[series.edge], bridge=allowed[series.bridge])

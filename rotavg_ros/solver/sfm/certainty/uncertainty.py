@@ -1,7 +1,8 @@
 """Uncertainty of refined orientations, relative to one node of each component.
 
 It is the least-squares covariance σ² L⁻¹ of the believed edges: each is weighted by the probability that it is no
-outlier, and σ² is the sum of squared residuals over the number of redundant edges. Noise is assumed round. Its diagonal
+outlier, and σ² is the sum of the squared residuals of edges with a score below one half over the number of those that
+are redundant. Noise is assumed round. Its diagonal
 is estimated from random samples of the answer. What a node's own edges contribute is known without any samples, and
 where nodes have many edges that is nearly all; there the samples come from conjugate gradients, without a
 factorisation.
@@ -21,7 +22,7 @@ from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem, incidenc
 from rotavg_ros.solver.sfm.certainty.probes import probe_signs
 from rotavg_ros.solver.sfm.laplacians.scalar import ScalarLaplacian
 from rotavg_ros.solver.sfm.priors import RefinementPriors, UncertaintyPriors
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 _WELL_KNIT_DEGREE = RefinementPriors().well_knit_degree
 PRIORS = UncertaintyPriors()
@@ -54,23 +55,24 @@ class _Samples(NamedTuple):
     value: Tensor
 
 
-def variances(graph: ViewGraph, angle: Tensor, score: Tensor, bridge: Tensor, to: References) -> Tensor | None:
+def variances(graph: ViewGraph, noise: Tensor, score: Tensor, bridge: Tensor, to: References) -> Tensor | None:
     """Variance ``(N,)`` rad² of each component of a node's error relative to its component's reference.
 
     NaN in trees, where nothing checks anything, and in well-knit components of graphs with more than a million edges;
     None if there are no others.
 
     Args:
-        angle: ``(M,)`` rad, residuals.
+        noise: ``(C,)`` rad², σ² of each component.
         score: ``(M,)`` probability that an edge is an outlier.
         bridge: ``(B,)`` edges that nothing checks: with the probability of their scores, the part behind them is turned
             by any rotation.
     """
     count = len(to.node)
     size = torch.bincount(to.component, minlength=count)
-    edges = torch.bincount(to.component[graph.source], minlength=count)
+    # Edges that the user has rejected check nothing.
+    edges = torch.bincount(to.component[graph.source[graph.label != EdgeLabel.REJECTED]], minlength=count)
     is_checked, is_loose = edges >= size, 2 * edges < _WELL_KNIT_DEGREE * size
-    weight, noise = (1 - score).clamp(min=PRIORS.least_weight), noise_variance(graph, angle, score, to.component)
+    weight, noise = (1 - score).clamp(min=PRIORS.least_weight), noise[to.component]
     turned = torch.zeros_like(score)
     turned[bridge] = score[bridge] * rotations.RANDOM_VARIANCE
     weight = 1 / (1 / weight + turned / noise[graph.source].clamp(min=PRIORS.least_noise))
@@ -88,16 +90,19 @@ def variances(graph: ViewGraph, angle: Tensor, score: Tensor, bridge: Tensor, to
 
 
 def noise_variance(graph: ViewGraph, angle: Tensor, score: Tensor, component: Tensor) -> Tensor:
-    """σ² ``(N,)`` rad² of each node's component."""
-    count, of_edge = int(component.max()) + 1, component[graph.source]
+    """σ² ``(C,)`` rad² of good edges' errors about each axis: believed edges' squared residuals over their redundancy.
 
-    def sums(value: Tensor) -> Tensor:
-        return value.new_zeros(count).index_add_(0, of_edge, value)
+    Others are left out, however small their weight would be: a thousandth of the square of 90° is that of 3°.
 
-    weight = (1 - score).clamp(min=PRIORS.least_weight)
+    Args:
+        angle: ``(M,)`` rad, residuals.
+        score: ``(M,)`` probability that an edge is an outlier, given its residual.
+    """
+    count, is_believed = int(component.max()) + 1, score < PRIORS.flagged
+    of_edge, square = component[graph.source[is_believed]], angle[is_believed].to(score).square()
     # Number of believed edges beyond a spanning tree, at least one.
-    checks = (sums((score < PRIORS.flagged).to(weight)) - torch.bincount(component, minlength=count) + 1).clamp(min=1)
-    return (sums(weight * angle.to(weight).square()) / (3 * checks))[component]
+    checks = torch.bincount(of_edge, minlength=count) - torch.bincount(component, minlength=count) + 1
+    return square.new_zeros(count).index_add_(0, of_edge, square) / (3 * checks.clamp(min=1))
 
 
 def _relative(graph: ViewGraph, weight: Tensor, samples: _Samples, to: References) -> Tensor:

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-from rotavg_ros import ViewGraph, rotations, solve
+from rotavg_ros import EdgeLabel, ViewGraph, rotations, solve
 from rotavg_ros.solver.sfm.certainty import uncertainty
 from test.solver.graphs import as_quaternions, measured, random_truth, small_noise
 
@@ -27,6 +28,7 @@ def _dense(num_nodes: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
     return source[kept], target[kept]
 
 
+_NOISE = torch.tensor([0.03**2], dtype=torch.float64)
 _GRAPHS = {"street": _street(60), "well knit": _dense(60, 20)}
 
 
@@ -45,13 +47,10 @@ def test_it_is_the_diagonal_of_the_least_squares_covariance(name: str) -> None:
     source, target = _GRAPHS[name]
     graph = measured(random_truth(60, 1), source, target)
     score = torch.from_numpy(rng.uniform(0, 0.9, len(source)))
-    angle = torch.from_numpy(rng.uniform(0.01, 0.05, len(source)))
     to = uncertainty.References(torch.zeros(60, dtype=torch.int64), torch.tensor([0]))
-    found = uncertainty.variances(graph, angle, score, torch.zeros(0, dtype=torch.int64), to)
+    found = uncertainty.variances(graph, _NOISE, score, torch.zeros(0, dtype=torch.int64), to)
     assert found is not None and float(found[0]) == 0
-    weight = 1 - score.numpy()
-    noise = float((weight * angle.numpy() ** 2).sum()) / (3 * (int((score < 0.5).sum()) - 59))
-    ratio = (found.numpy()[1:] / (noise * _exact(graph, weight))) ** 0.5
+    ratio = (found.numpy()[1:] / (float(_NOISE) * _exact(graph, 1 - score.numpy()))) ** 0.5
     assert np.allclose(ratio, 1, atol=0.3 if name == "street" else 0.03)
 
 
@@ -63,13 +62,10 @@ def test_what_hardly_joins_two_well_knit_parts_counts(score: float) -> None:
     graph = measured(random_truth(120, 2), *ends)
     scores = torch.zeros(graph.num_edges, dtype=torch.float64)
     scores[-2:] = score
-    angle = torch.full_like(scores, 0.03)
     to = uncertainty.References(torch.zeros(120, dtype=torch.int64), torch.tensor([0]))
-    found = uncertainty.variances(graph, angle, scores, torch.zeros(0, dtype=torch.int64), to)
+    found = uncertainty.variances(graph, _NOISE, scores, torch.zeros(0, dtype=torch.int64), to)
     assert found is not None
-    weight = (1 - scores.numpy()).clip(1e-3)
-    noise = float((weight * 0.03**2).sum()) / (3 * (int((scores < 0.5).sum()) - 119))
-    ratio = (found.numpy()[1:] / (noise * _exact(graph, weight))) ** 0.5
+    ratio = (found.numpy()[1:] / (float(_NOISE) * _exact(graph, (1 - scores.numpy()).clip(1e-3)))) ** 0.5
     assert np.allclose(ratio[:59], 1, atol=0.03)
     assert np.allclose(ratio[59:], 1, atol=0.3)
 
@@ -89,6 +85,25 @@ def test_errors_over_draws_of_the_noise_are_as_stated(name: str) -> None:
     assert float(stated[0][0]) == 0
     ratio = (torch.stack(squares).mean(0)[1:] / torch.stack(stated).mean(0)[1:]).sqrt()
     assert 0.7 < float(ratio.median()) < 1.4
+
+
+@pytest.mark.parametrize("noise_deg", [0.3, 1.0])
+def test_false_edges_do_not_count_as_noise(noise_deg: float) -> None:
+    """Sixty of a hundred edges have any rotation."""
+    source, target = np.triu_indices(40, k=1)
+    truth = random_truth(40, 5)
+    root = as_quaternions(truth * truth[0].inv())
+    ratios = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        noise, anyhow = small_noise(len(source), noise_deg, seed), Rotation.random(len(source), random_state=seed)
+        false = rng.random(len(source)) < 0.6
+        noise = Rotation.from_quat(np.where(false[:, None], anyhow.as_quat(), noise.as_quat()))
+        solution = solve(measured(truth, source, target, noise), profile="sfm")
+        error = rotations.log(rotations.multiply(rotations.inverse(root), solution.body_from_world))[1:]
+        ratios.append(float(((error**2).mean(dim=1) / solution.uncertainty[1:] ** 2).mean().sqrt()))
+    # Edges whose residuals are hardly above 20° are still believed to some extent.
+    assert 0.25 < np.mean(ratios) < 1.3
 
 
 def test_each_component_states_its_own() -> None:
@@ -116,3 +131,17 @@ def test_well_knit_graphs_with_too_many_edges_state_none(monkeypatch: pytest.Mon
 def test_a_tree_states_none() -> None:
     tree = measured(random_truth(9, 8), np.arange(8), np.arange(8) + 1)
     assert bool(solve(tree, profile="sfm").uncertainty.isnan().all())
+
+
+@pytest.mark.parametrize("closing", [[], [(9, 3)], [(9, 3), (7, 1), (5, 2)]])
+def test_rejected_edges_check_nothing(closing: list[tuple[int, int]]) -> None:
+    """Ten cameras in a row, with edges that close cycles, state the same with and without others that are rejected."""
+    ends = np.array([*zip(range(9), range(1, 10), strict=True), *closing, (9, 0), (8, 2), (4, 0)]).T
+    relative = measured(random_truth(10, 1), *ends, small_noise(len(ends[0]), 1.0, 3)).target_from_source.numpy()
+    relative[-3:-1] = as_quaternions(random_truth(2, 9))
+    label = np.repeat([EdgeLabel.AUTOMATIC, EdgeLabel.REJECTED], [len(relative) - 3, 3])
+    rejected = ViewGraph.create(*ends, relative, num_nodes=10, label=label)
+    removed = rejected.select_edges(torch.arange(len(relative) - 3))
+    one, other = (solve(graph, profile="sfm") for graph in (rejected, removed))
+    assert torch.allclose(one.outlier_score[:-3], other.outlier_score, atol=0.02)
+    assert torch.allclose(one.uncertainty, other.uncertainty, rtol=0.2, equal_nan=True)
