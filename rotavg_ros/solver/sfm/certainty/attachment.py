@@ -159,8 +159,7 @@ class Attachment:
         node = np.unique(self.parts.node)
         own[node[is_any]] = self.variance[is_any]
         total = accumulate_to_root(forest, own)
-        level = accumulate_to_root(forest, np.ones(len(own))).astype(np.int64)
-        meeting = lowest_common_ancestors(forest.parent, level, np.arange(len(own)), reference)
+        meeting = lowest_common_ancestors(forest.parent, self.parts.level, np.arange(len(own)), reference)
         between = total + total[reference] - 2 * total[meeting]
         return np.asarray(np.minimum(between, rotations.RANDOM_VARIANCE))
 
@@ -173,17 +172,12 @@ def _likeliest(
     found: list[tuple[_Peaks, np.ndarray, np.ndarray, np.ndarray]],
 ) -> Turns:
     """Of the turns ``(4, P)`` stated for each part the one of most mass, beside the ``present`` one ``(K,)``."""
-    change, turn = np.full(len(node), np.inf), rows.identities(len(node))
     tries = np.concatenate([one for _, one, *_ in found])
     mass = np.concatenate([peaks.log_mass for peaks, *_ in found])
-    order = np.lexsort((tries, -mass, part[tries]))
-    at, first = np.unique(part[tries[order]], return_index=True)
-    chosen = order[first]
-    change[at] = present[at] + PRIORS.ahead - mass[chosen]
-    turn[:, at] = stated[:, tries[chosen]]
+    turns = Turns.least(node, part, tries, present[part[tries]] + PRIORS.ahead - mass, stated)
     # Two edges leave the turn open, and the misfit is spread between them.
-    change[np.bincount(part, minlength=len(node)) < _SEVERAL] = np.inf
-    return Turns(node, change, turn)
+    turns.change[np.bincount(part, minlength=len(node)) < _SEVERAL] = np.inf
+    return turns
 
 
 class _Peaks(NamedTuple):

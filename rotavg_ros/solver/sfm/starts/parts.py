@@ -44,6 +44,27 @@ class Turns:
     change: np.ndarray
     turn: np.ndarray
 
+    @classmethod
+    def least(
+        cls, node: np.ndarray, branch: np.ndarray, tries: np.ndarray, cost: np.ndarray, stated: np.ndarray
+    ) -> Turns:
+        """Of the turns that edges state the one of least cost for each branch; of several, the first.
+
+        Args:
+            node: ``(K,)``.
+            branch: ``(P,)`` index of the branch that an edge joins.
+            tries: ``(T,)`` the edges whose turns are tried.
+            cost: ``(T,)`` change of the cost by each.
+            stated: ``(4, P)`` the turns.
+        """
+        order = np.lexsort((tries, cost, branch[tries]))
+        at, first = np.unique(branch[tries[order]], return_index=True)
+        chosen = order[first]
+        change, turn = np.full(len(node), np.inf), rows.identities(len(node))
+        change[at] = cost[chosen]
+        turn[:, at] = stated[:, tries[chosen]]
+        return cls(node, change, turn)
+
 
 @dataclass(frozen=True)
 class Parts:
@@ -54,6 +75,7 @@ class Parts:
         measured: ``(4, M)`` target_from_source.
         weight: ``(M,)`` w of the cost.
         forest: the tree of each component.
+        level: ``(N,)`` int, number of the tree's edges between each node and its root.
         size: ``(N,)`` number of nodes of the branch below each node, itself included.
         node: ``(P,)`` topmost node of the branch; sorted.
         edge, inside: ``(P,)`` an edge that joins the branch, and its end within the branch.
@@ -64,6 +86,7 @@ class Parts:
     measured: np.ndarray
     weight: np.ndarray
     forest: SpanningForest
+    level: np.ndarray
     size: np.ndarray
     node: np.ndarray
     edge: np.ndarray
@@ -87,7 +110,7 @@ class Parts:
         size = sums_of_branches(forest.parent, level, np.ones(graph.num_nodes))
         used = np.flatnonzero(is_used)
         node, edge, inside = _joining(forest, level, source[used], target[used], priors.starts.part_edges)
-        return cls(source, target, measured, weights, forest, size, node, used[edge], inside)
+        return cls(source, target, measured, weights, forest, level, size, node, used[edge], inside)
 
     def turns(self, body_from_world: np.ndarray) -> Turns:
         """The best turn of each branch, given orientations ``(4, N)``."""
@@ -101,13 +124,8 @@ class Parts:
             cosine = np.einsum("ip,ip->p", stated[:, one[which]], stated[:, other])
             cost[begin : begin + len(one)] = np.bincount(which, weight[other] * np.sqrt(rows.angle(cosine)), len(one))
             begin += len(one)
-        order = np.lexsort((tries, cost, branch[tries]))
-        at, best = np.unique(branch[tries[order]], return_index=True)
-        chosen = order[best]
-        change, turn = np.full(len(node), np.inf), rows.identities(len(node))
-        change[at] = cost[chosen] - np.bincount(branch, weight * np.sqrt(angle), len(node))[at]
-        turn[:, at] = stated[:, tries[chosen]]
-        return Turns(node, change, turn)
+        cost -= np.bincount(branch, weight * np.sqrt(angle), len(node))[branch[tries]]
+        return Turns.least(node, branch, tries, cost, stated)
 
     def pairs(self, chosen: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Some of the P edges, each beside all edges that join the same branch; some millions of pairs at a time.
