@@ -37,6 +37,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise TrainCommandError("slam fine-tunes on your runs and needs --from GRAPH…; other networks take none")
     if arguments.network == "slam":
         return train_on_robot.run(arguments)
+    if arguments.truth is not None:
+        raise TrainCommandError("--truth is for slam; other networks learn on simulated graphs")
     name = _config_name(arguments)
     config = load_config(name)
     trainer = make_trainer(

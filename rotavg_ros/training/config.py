@@ -13,6 +13,9 @@ import yaml
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily, RobotFamilyError
 from rotavg_ros.errors import UserError
 
+# Number of seeds that torch tells apart.
+_SEEDS = 1 << 64
+
 
 class TrainingConfigError(UserError):
     """A training configuration that cannot be used; the message names the file and the key."""
@@ -90,8 +93,8 @@ class TrainingConfig:
             raise TrainingConfigError(f"learning_rate is {self.learning_rate}; it must be positive")
         if not 0 <= self.weight_decay < math.inf:
             raise TrainingConfigError(f"weight_decay is {self.weight_decay}; it must not be negative")
-        if self.seed < 0:
-            raise TrainingConfigError(f"seed is {self.seed}; it must not be negative")
+        if not 0 <= self.seed < _SEEDS:
+            raise TrainingConfigError(f"seed is {self.seed}; it must be a whole number from 0 to 2⁶⁴ - 1")
         if not 0 <= self.averaging < 1:
             raise TrainingConfigError(f"averaging is {self.averaging}; a share in [0, 1)")
         if not 0 <= self.edge_dropout < 1:
@@ -109,7 +112,7 @@ class TrainingConfig:
         except OSError as error:
             raise TrainingConfigError(f"{path}: cannot be read ({error.strerror}); give a YAML file") from None
         except (ValueError, yaml.YAMLError) as error:  # not UTF-8, a date that does not exist
-            reason = str(error).splitlines()[0]
+            reason = " ".join(str(error).split())
             raise TrainingConfigError(f"{path}: not a readable YAML file ({reason})") from None
         except RecursionError:
             raise TrainingConfigError(f"{path}: is nested too deeply; expected `key: value` lines") from None
@@ -130,7 +133,7 @@ class TrainingConfig:
                 values[key] = None if value is None else _family(value, origin)
                 continue
             try:
-                values[key] = tuple(_whole(item) for item in value) if kind is tuple else _CONVERSIONS[kind](value)
+                values[key] = _CONVERSIONS[kind](value)
             except (TypeError, ValueError, OverflowError):
                 raise TrainingConfigError(f"{origin}: {key} is {value!r}, expected like {defaults[key]!r}") from None
             if kind is tuple and len(values[key]) != 2:
@@ -146,6 +149,20 @@ class TrainingConfig:
         return {key: _plain(value) for key, value in plain.items()}
 
 
+def _text(value: Any) -> str:
+    """The text; ``str`` would take a key without a value for 'None'."""
+    if not isinstance(value, str):
+        raise TypeError(value)
+    return value
+
+
+def _pair(value: Any) -> tuple[int, ...]:
+    """A list's whole numbers; ``tuple`` would take the digits of a text, and the keys of a mapping."""
+    if not isinstance(value, list | tuple):
+        raise TypeError(value)
+    return tuple(_whole(item) for item in value)
+
+
 def _whole(value: Any) -> int:
     """The number, if it is whole; ``int`` would drop a fraction and take ``true`` for 1."""
     if isinstance(value, bool) or (isinstance(value, float) and not value.is_integer()):
@@ -159,7 +176,7 @@ def _number(value: Any) -> float:
     return float(value)
 
 
-_CONVERSIONS: dict[type, Callable[[Any], Any]] = {int: _whole, float: _number, str: str}
+_CONVERSIONS: dict[type, Callable[[Any], Any]] = {int: _whole, float: _number, str: _text, tuple: _pair}
 
 
 def _plain(value: Any) -> Any:

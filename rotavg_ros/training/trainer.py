@@ -104,6 +104,7 @@ class Trainer:
                 self._checkpoint_path, task.network, self.optimizer, self._average, self._identity()
             )
             self._state = _State(**state)
+            self._check_best()
         with self._writing():
             self._drop_log_after(self._state.epoch)
 
@@ -132,6 +133,8 @@ class Trainer:
             losses = self._train(epoch)
             with torch.no_grad(), self._averaged(), self._writing():
                 figures = self.task.validate()
+                if not math.isfinite(figures["objective"]):
+                    raise TrainingError(_no_number("validation's objective", epoch))
                 seconds = self._state.seconds + time.perf_counter() - start
                 best = min(self._state.best, figures["objective"])
                 is_better = best < self._state.best
@@ -163,7 +166,7 @@ class Trainer:
         totals: dict[str, float] = {}
         for terms in self.task.batches(rng):
             if not bool(torch.isfinite(terms["loss"])):
-                raise TrainingError(f"the loss is no number any more in epoch {epoch}; lower learning_rate")
+                raise TrainingError(_no_number("loss", epoch))
             self.optimizer.zero_grad()
             terms["loss"].backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(network.parameters(), _MAX_GRADIENT_NORM)
@@ -228,6 +231,13 @@ class Trainer:
         with self._log_path.open("a") as log:
             log.write(json.dumps(row) + "\n")
 
+    def _check_best(self) -> None:
+        """Refuse a checkpoint without the best weights before it, which it does not hold itself."""
+        for path in (self.weights_path, self.card_path):
+            if not path.exists():
+                what = f"put it back, or remove {self._checkpoint_path.name}, which goes on from there, to start anew"
+                raise TrainingError(f"{path}: is missing; {what}")
+
     def _drop_log_after(self, epoch: int) -> None:
         """Remove the log lines of epochs that will be repeated."""
         if self._log_path.exists():
@@ -241,6 +251,10 @@ def fingerprint(network: nn.Module) -> str:
     for key, value in sorted(network.state_dict().items()):
         digest.update(key.encode() + value.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]
+
+
+def _no_number(what: str, epoch: int) -> str:
+    return f"the {what} is no number any more in epoch {epoch}; lower learning_rate"
 
 
 def _hardware(network: nn.Module) -> str:

@@ -93,6 +93,7 @@ def test_training_goes_on_from_given_weights(config: Path, tmp_path: Path) -> No
         (["fine-net", "sfm-fine-net", "--start", str(WEIGHTS_FOLDER)], "is a folder, need sfm-fine-net.safetensors"),
         (["clean-net", str(WEIGHTS_FOLDER)], "cannot be read (Is a directory)"),
         (["fine-net", "slam-clean-net", "--start", str(OTHER_WEIGHTS)], "needs `recipe: robots`"),
+        (["clean-net", "sfm-clean-net", "--truth", "x.csv"], "--truth is for slam"),
         (["clean-net", "sfm-clean-net", "--threads", "0"], "must be 1 or more"),
         (["big-net", "sfm-clean-net"], "big-net"),
     ],
@@ -119,6 +120,8 @@ def test_mistakes_take_one_line(
         ("nodes: " + "[" * 5000 + "]" * 5000, "is nested too deeply"),
         ("learning_rate: .nan", "learning_rate is nan"),
         ("seed: -1", "seed is -1"),
+        ("seed: 18446744073709551616", "it must be a whole number from 0 to 2⁶⁴ - 1"),
+        ("epochs: 3\n\tgraphs: 4", "line 2"),
         ("graphs: .inf", "graphs is inf"),
     ],
 )

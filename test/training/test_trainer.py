@@ -234,6 +234,25 @@ def test_loss_that_is_no_number_stops_the_run(tmp_path: Path) -> None:
     assert not (tmp_path / "sfm-clean-net.safetensors").exists()
 
 
+@pytest.mark.parametrize("objective", [float("nan"), float("inf")])
+def test_validation_that_is_no_number_stops_the_run(objective: float, tmp_path: Path) -> None:
+    task, config = make_task("sfm-clean-net")
+    task.validate = lambda: {"objective": objective}  # type: ignore[method-assign]
+    with pytest.raises(UserError, match="the validation's objective is no number any more in epoch 0; lower"):
+        Trainer(task, config, tmp_path, "sfm-clean-net").run()
+    assert not list(tmp_path.glob("*.safetensors"))
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".json"])
+def test_a_checkpoint_without_the_best_weights_is_refused(suffix: str, tmp_path: Path) -> None:
+    make_trainer("sfm-clean-net", tmp_path).run(max_epochs=1)
+    before = log(tmp_path, "sfm-clean-net")
+    (tmp_path / f"sfm-clean-net{suffix}").unlink()
+    with pytest.raises(UserError, match=rf"sfm-clean-net\{suffix}: is missing; put it back, or remove sfm-clean-net"):
+        make_trainer("sfm-clean-net", tmp_path)
+    assert log(tmp_path, "sfm-clean-net") == before
+
+
 def test_training_reduces_the_loss(tmp_path: Path) -> None:
     config = TrainingConfig(**{**vars(SFM), "epochs": 25, "learning_rate": 5e-3})
     Trainer(SfmCleanTask(config, CPU), config, tmp_path, "sfm-clean-net").run()
@@ -271,7 +290,11 @@ def test_a_family_survives_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "line", ["graphs: 2.5", "epochs: true", "nodes: [10.5, 20]", "learning_rate: true", "graphs: [3]"]
+    "line",
+    [
+        *("graphs: 2.5", "epochs: true", "nodes: [10.5, 20]", "learning_rate: true", "graphs: [3]"),
+        *("goes_on_from:", "recipe: [wide]", "nodes: {12: 3, 20: 4}", 'nodes: "99"'),
+    ],
 )
 def test_numbers_are_taken_as_they_are_or_not_at_all(line: str, tmp_path: Path) -> None:
     path = tmp_path / "robots.yaml"

@@ -131,7 +131,7 @@ class RobotFamily:
                     values[key] = float(low), float(high)
                 else:
                     values[key] = float(value)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 raise RobotFamilyError(f"{key} is {value!r}, expected like {default!r}") from None
         return cls(**values)
 
