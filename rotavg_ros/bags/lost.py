@@ -34,6 +34,7 @@ class Lost:
     def told(self, reader: AnyReader) -> str:
         """The losses in a line; ``reader`` reads what is left."""
         start_ns, end_ns = int(reader.start_time), int(reader.end_time)
+        start_ns = min([start_ns, *(place.start_ns for losses in self.recordings for place in losses.chunks)])
         parts = [line for losses in self.recordings for line in losses.told(start_ns, end_ns)]
         parts += [] if parts or self.cause is None else [self.cause]
         topics = Counter(topic for topic, _ in self.undecodable)

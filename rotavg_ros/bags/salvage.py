@@ -57,7 +57,8 @@ class Losses:
         """A line for each loss.
 
         Args:
-            start_ns, end_ns: of all messages of the bag that can be read.
+            start_ns: of the bag's first message, readable or not.
+            end_ns: of all messages of the bag that can be read.
         """
         lines = []
         if self.chunks:
