@@ -12,6 +12,7 @@ from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.simulation.robot_run import RobotRun
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
+from rotavg_ros.errors import asking_about
 from rotavg_ros.whole_file import real
 
 
@@ -34,8 +35,8 @@ def simulate(arguments: argparse.Namespace) -> SimulatedRun:
 def run(arguments: argparse.Namespace) -> int:
     """Simulate and write."""
     refuse_existing(arguments.output, overwrite=arguments.overwrite)
-    if arguments.graph is not None and real(arguments.output) in real(arguments.graph).parents:
-        raise BagWriteError(f"{arguments.graph}: is in the bag, which is written after it; choose another --graph")
+    if arguments.graph is not None:
+        _check_graph(arguments)
     with working("simulating"):
         simulated = simulate(arguments)
         # First the step that is more likely to fail, so that a failed command leaves no bag behind.
@@ -44,6 +45,15 @@ def run(arguments: argparse.Namespace) -> int:
         write_run_bag(arguments.output, simulated, overwrite=arguments.overwrite)
     print(f"{arguments.output}: {describe(simulated)}")
     return 0
+
+
+def _check_graph(arguments: argparse.Namespace) -> None:
+    with asking_about(arguments.graph, BagWriteError):
+        exists = arguments.graph.exists()
+    if real(arguments.output) in real(arguments.graph).parents:
+        raise BagWriteError(f"{arguments.graph}: is in the bag, which is written after it; choose another --graph")
+    if exists and not arguments.overwrite:
+        raise BagWriteError(f"{arguments.graph}: exists already; choose another --graph or give --overwrite")
 
 
 def describe(simulated: SimulatedRun) -> str:

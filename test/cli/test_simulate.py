@@ -101,6 +101,19 @@ def test_a_graph_is_not_replaced_by_its_bag(tmp_path: Path, capsys: pytest.Captu
     assert said == f"rotavg: error: {graph}: is in the bag, which is written after it; choose another --graph\n"
 
 
+def test_an_existing_graph_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    graph = tmp_path / "graph.g2o"
+    graph.write_text("mine")
+    command = ["simulate", "--laps", "1", "--output", str(tmp_path / "run"), "--graph", str(graph)]
+    assert main(command) == 2
+    said = capsys.readouterr().err
+    assert said == f"rotavg: error: {graph}: exists already; choose another --graph or give --overwrite\n"
+    assert graph.read_text() == "mine"
+    assert not (tmp_path / "run").exists()
+    assert main([*command, "--overwrite"]) == 0
+    assert graph.read_text() != "mine"
+
+
 @pytest.mark.parametrize("number", ["-2", "-0.5", "-.5", "-3.", "-1e-3", "-2.5E+1"])
 def test_a_number_below_zero_is_no_option(number: str) -> None:
     parsed = parse(["simulate", "--output", "run", "--odometry-bias-deg-per-min", number])

@@ -16,7 +16,7 @@ from rotavg_ros.datasets.worlds import ROBOT_WORLDS
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``rotavg simulate``."""
     parser.add_argument("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to write")
-    parser.add_argument("--overwrite", action="store_true", help="replace an older bag")
+    parser.add_argument("--overwrite", action="store_true", help="replace an older bag and graph")
     parser.add_argument("--graph", type=Path, metavar="FILE", help="also write the pose graph (.g2o, .npz)")
     add_run_arguments(parser)
 
