@@ -51,7 +51,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Solve every graph; a bad one does not stop the others."""
     if arguments.without:
         if arguments.method != methods.DEFAULT_METHOD:
-            raise SolveError(f"--without is for --method {methods.DEFAULT_METHOD}, not {arguments.method}")
+            methods.check_choices(arguments.method, arguments.profile, arguments.device)
+            raise SolveError(
+                f"--without leaves out parts of --method {methods.DEFAULT_METHOD}, not of {arguments.method}; leave "
+                "one of the two options out"
+            )
         arguments.method = methods.without(*arguments.without)
     jobs = plan(arguments.graphs, arguments.output, poses=arguments.poses)
     solve_graph: Callable[[ViewGraph], Solution] = partial(
