@@ -77,20 +77,20 @@ def mostly_flagged(graph: ViewGraph, outlier_score: Tensor, rotation_score: Tens
     by_place = 0 if rotation_score is None else int((is_flagged & (rotation_score <= _FLAGGED)).sum())
     if 2 * by_place > flagged:
         return (
-            f"{flagged} of {closures} loop closures are flagged as false, {by_place} of them for their places alone; "
-            "translations may not be in metres or not in the frame of their edge's source, then mend them or set "
-            "translation_scale to none; the odometry's position may have jumped somewhere, then leave that edge out; "
-            "or the front end may match wrong places",
+            f"{flagged} of {closures} loop closures are flagged as false, {by_place} of them only because they join "
+            "wrong places; if translations are not in metres, or not in the frame of their edge's source, correct them "
+            "or set translation_scale to none; if the odometry's position jumped somewhere, leave that edge out; "
+            "otherwise the front end may match wrong places",
         )
     if not bool(graph.is_odometry.any()):
         return (
-            f"{flagged} of {closures} edges are flagged as false; views may look alike that are not of one place, or "
-            "some rotations be stated from target to source: compare some with the pictures by hand",
+            f"{flagged} of {closures} edges are flagged as false; different places may look alike, or some rotations "
+            "may be stated from target to source: compare some of these edges with the pictures by hand",
         )
     return (
-        f"{flagged} of {closures} loop closures are flagged as false; the front end may match wrong places, or all of "
-        "them may have a wrong direction, sensor mounting or clock: check that each edge's rotation is the target's in "
-        "the source's frame, and compare some with the odometry by hand",
+        f"{flagged} of {closures} loop closures are flagged as false; the front end may match wrong places, or the "
+        "direction, the sensor's mounting or the clock may be wrong for all of them: check that each edge's rotation "
+        "is the target's orientation in the source's frame, and compare some closures with the odometry by hand",
     )
 
 
@@ -111,8 +111,8 @@ def stating_nothing(graph: ViewGraph) -> tuple[str, ...]:
     if count <= len(touched) or float(sine[~is_identity].median()) < _SOME_ROTATION:
         return ()
     return (
-        f"{count} of {graph.num_edges} edges state exactly no rotation; if the front end writes that where it found "
-        "nothing, they agree with each other and make all orientations alike: leave such edges out",
+        f"{count} of {graph.num_edges} edges state exactly no rotation; they agree with each other, and so make "
+        "orientations alike: if the front end writes such edges where it found no match, leave them out",
     )
 
 
@@ -145,8 +145,8 @@ def _gaps_of_places(graph: ViewGraph) -> str | None:
         return None
     return (
         f"{num_odometry - num_known} of {num_odometry} odometry edges have no translation, so closures are judged by "
-        "their rotations alone, and one that joins wrong places may be believed; odometry of every robot must state "
-        "its position throughout"
+        "their rotations alone, and one that joins wrong places may be believed; the odometry of every robot must "
+        "state its position throughout"
     )
 
 
@@ -158,8 +158,8 @@ def _far_from_odometry(odometry: _Odometry, body_from_world: Tensor, believed: i
         return None
     count = "1 believed loop closure turns" if believed == 1 else f"{believed} believed loop closures turn"
     return (
-        f"{count} the orientations by {math.degrees(angle):.0f}° in the mean from odometry's; so few may be false "
-        "together: look at them, label those that are wrong, or compare with odometry alone"
+        f"{count} the orientations away from odometry's by {math.degrees(angle):.0f}° on average; so few closures may "
+        "all be false: look at them, label those that are wrong, or compare with odometry alone"
     )
 
 
@@ -305,7 +305,7 @@ def _mistaken_convention(odometry: _Odometry, closures: ViewGraph) -> str | None
     if is_reordered:
         whose = "their" if best is None else best.hypothesis.whose
         return (
-            f"odometry edges turn by {math.degrees(stated):.0f}° in the median, and would by "
+            f"the median odometry edge turns by {math.degrees(stated):.0f}°, and would turn by "
             f"{math.degrees(reordered):.0f}° with {whose} quaternions in the order w, x, y, z; {order}"
         )
     if best is None:
@@ -313,8 +313,9 @@ def _mistaken_convention(odometry: _Odometry, closures: ViewGraph) -> str | None
     if best.hypothesis.is_order:
         return f"{best}; {order}"
     return (
-        f"{best}; {_OR_THOSE if best.hypothesis == _INVERTED else 'they'} may be the source's in the target's frame, "
-        "while the target's in the source's is read: invert them, or swap source and target of these edges"
+        f"{best}; {_OR_THOSE if best.hypothesis == _INVERTED else 'they'} may state the source's orientation in the "
+        "target's frame, but the target's in the source's frame is read: invert them, or swap source and target of "
+        "these edges"
     )
 
 

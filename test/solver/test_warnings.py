@@ -87,7 +87,7 @@ def test_another_order_of_quaternions(seed: int, dimensions: int) -> None:
         (text,) = found(changed(graph, written_in_another_order, edges))
         assert "in the order w, x, y, z; w, x, y, z may have been written" in text
         assert ("the closures' rotations" in text) == (edges is not None and not edges[0])
-        assert text.startswith("odometry edges turn by 1") == (edges is None or bool(edges[0]))
+        assert text.startswith("the median odometry edge turns by 1") == (edges is None or bool(edges[0]))
     # Where what is written is what is stored.
     (text,) = found(changed(graph, lambda rotation: rotation[:, [3, 0, 1, 2]], ~graph.is_odometry))
     assert "the closures' rotations in the order w, x, y, z" in text
@@ -98,7 +98,7 @@ def test_another_order_shows_without_closures() -> None:
     odometry = graph.select_edges(graph.is_odometry)
     assert found(odometry) == ()
     (text,) = found(changed(odometry, written_in_another_order))
-    assert text.startswith("odometry edges turn by 1")
+    assert text.startswith("the median odometry edge turns by 1")
 
 
 def test_more_drift_than_the_narrow_tolerance_allows() -> None:
@@ -220,7 +220,7 @@ def test_places_in_millimetres_and_places_that_are_missing() -> None:
 
     assert warned(1.0) == ()
     (text,) = warned(1000.0)
-    assert "for their places alone; translations may not be in metres" in text and "translation_scale" in text
+    assert "join wrong places; if translations are not in metres" in text and "translation_scale" in text
     shift[7] = np.nan
     (text,) = warned(1.0)
     assert text.startswith("1 of 119 odometry edges have no translation, so closures are judged by their rotations")
@@ -240,7 +240,7 @@ def test_few_closures_that_turn_the_answer() -> None:
     turned = rotations.multiply(rotations.exp(yaw), gauge)
     for bent, start in ((one, "1 believed loop closure turns"), (nine, "9 believed loop closures turn")):
         (text,) = warnings.of_whole_solve(bent, turned, torch.zeros(bent.num_edges))
-        assert text.startswith(start) and "by 42° in the mean" in text
+        assert text.startswith(start) and "by 42° on average" in text
         assert warnings.of_whole_solve(bent, gauge.expand(10, 4), torch.zeros(bent.num_edges)) == ()
         assert warnings.of_whole_solve(bent, turned, torch.ones(bent.num_edges)) == ()
     assert warnings.of_whole_solve(ten, turned, torch.zeros(ten.num_edges)) == ()

@@ -44,9 +44,8 @@ _TUNING_PAYS = 200_000
 # Quaternions that differ by less are the same.
 _ROUNDING = 1e-9
 _NEARLY_AS_GOOD = (
-    "of two answers, in which {} of {} orientations differ by more than 20°, neither fits clearly better; part of the "
-    "views is joined to the rest by few edges, or by edges that contradict each other: look whether it fits, or match "
-    "more pairs"
+    "two answers fit about equally well; {} of {} orientations differ between them by more than 20°, because few edges "
+    "or contradictory ones join part of the views to the rest: check whether that part fits, or match more pairs"
 )
 
 

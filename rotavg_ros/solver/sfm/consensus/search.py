@@ -25,13 +25,13 @@ CONSENSUS = ConsensusPriors()
 # Edges without a closing triangle are used last.
 _NO_VOTE = 1e-6
 _OTHER = (
-    "edges that contradict each other agree among themselves: of two answers, in which {apart} of {all} orientations "
-    "differ by more than 20°, the likelier one was taken; false edges that agree can be likelier than good ones, so "
-    "look whether these views fit"
+    "some edges contradict others but agree among themselves, so there are two answers; {apart} of {all} orientations "
+    "differ between them by more than 20°, and the likelier answer was taken: false edges that agree can be likelier "
+    "than good ones, so check whether these views fit"
 )
 _TOO_LARGE = (
-    "edges that contradict the answer agree among themselves, so that there may be another one; the graph is too large "
-    "for it to be looked for: look whether the views fit, or solve a part of them"
+    "some edges contradict the answer but agree among themselves, so there may be another answer; the graph is too "
+    "large to search for it: check whether the views fit, or solve a part of them"
 )
 
 

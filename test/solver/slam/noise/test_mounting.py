@@ -174,7 +174,7 @@ def test_a_camera_on_a_robot_in_the_plane() -> None:
     assert error_deg(case, solution) == pytest.approx(error_deg(case, as_said), abs=0.02)
     assert torch.equal(solution.outlier_score > 0.5, as_said.outlier_score > 0.5)
     (note,) = (text for text in solution.warnings if "mounted" in text)
-    assert "neurora~mounting" in note and "edge_sensor_orientations" in note and "about the axis of all turns" in note
+    assert "neurora~mounting" in note and "edge_sensor_orientations" in note and "axis that all rotations share" in note
 
 
 def test_the_note_says_what_the_nodes_parameter_wants() -> None:

@@ -37,7 +37,7 @@ def errors_of(case: Case, solution: Solution) -> tuple[float, float]:
 
 
 def warned_of_jumps(solution: Solution) -> list[str]:
-    return [warning for warning in solution.warnings if "held to have jumped" in warning]
+    return [warning for warning in solution.warnings if "seems to have jumped" in warning]
 
 
 def jumped(graph: ViewGraph, step: int, shift: tuple[float, float, float]) -> ViewGraph:

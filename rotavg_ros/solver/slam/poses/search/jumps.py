@@ -145,9 +145,9 @@ def jump_warnings(pose: PoseMode) -> tuple[str, ...]:
     first, last = sorted(int(drawn.nodes[end[largest]]) for end in ends)
     times = "once" if len(jumped) == 1 else f"{len(jumped)} times"
     return (
-        f"Odometry's position is held to have jumped {times} while its heading did not, the farthest by "
-        f"{far[largest]:.1f} m between nodes {first} and {last}, because closures across it agree that it has: wheels "
-        "that spun, or a tracker that was lost.",
+        f"Odometry's position seems to have jumped {times} while its heading did not, by up to {far[largest]:.1f} m "
+        f"(between nodes {first} and {last}): closures on both sides agree on that. Wheels may have spun, or a tracker "
+        "may have been lost.",
     )
 
 

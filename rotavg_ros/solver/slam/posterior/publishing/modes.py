@@ -117,9 +117,9 @@ def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: li
     closures, steps = int(differs[problem.closure].sum()), int(differs[problem.graph.is_odometry].sum())
     turned = np.degrees(max(largest[number] for number in others))
     return (
-        f"Other answers are nearly as likely ({100 * share[others].sum():.0f} %): they disagree about {closures} "
-        f"closures and {steps} stretches of odometry, and turn parts of the map by up to {turned:.0f}°. What is "
-        "published is their median; see its uncertainty, and label the closures that you know.",
+        f"Other answers are nearly as likely ({100 * share[others].sum():.0f} %): they judge {closures} closures and "
+        f"{steps} stretches of odometry differently, and turn parts of the map by up to {turned:.0f}°. The published "
+        "orientations are the median of all: look at their uncertainty, and label the closures that you know.",
     )
 
 

@@ -1,4 +1,4 @@
-"""Warnings for the user about a labelling: large slips, and a sensor mounted otherwise than stated."""
+"""Warnings for the user about a labelling: large slips, and a sensor mounted differently from what is stated."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _FAR_SLIP = np.radians(10.0)
 
 
 def notes_of(mode: Mode, suspected: np.ndarray | None = None) -> tuple[str, ...]:
-    """Warnings about large slips of odometry, and about a sensor mounted, or possibly mounted, otherwise than stated.
+    """Warnings about large slips, and about a sensor that is, or may be, mounted differently from what is stated.
 
     Args:
         mode: the labelling.
@@ -34,19 +34,19 @@ def _of_slips(mode: Mode) -> tuple[str, ...]:
     first, last = sorted((int(graph.nodes[graph.source[largest]]), int(graph.nodes[graph.target[largest]])))
     times = "once" if len(far) == 1 else f"{len(far)} times"
     slipped = (
-        f"Odometry is held to have slipped {times}, the farthest by {np.degrees(turned.max()):.0f}° between nodes "
-        f"{first} and {last}"
+        f"Odometry seems to have slipped {times}, by up to {np.degrees(turned.max()):.0f}° (between nodes {first} and "
+        f"{last})"
     )
     if bool(graph.is_odometry.all()):
-        return (f"{slipped}, because other odometry between the same nodes says so: one of the two is wrong there.",)
+        return (f"{slipped}: other odometry between the same nodes disagrees with it, so one of the two is wrong.",)
     remedy = "label the closures that you know"
     if "slips" not in mode.problem.without:
         remedy = f"solve without slips (neurora~slips), or {remedy}"
     elif "tails" not in mode.problem.without:
-        remedy = f"solve without tails of its noise, too (neurora~slips,tails), or {remedy}"
+        remedy = f"solve without tails of its noise as well (neurora~slips,tails), or {remedy}"
     return (
-        f"{slipped}, because closures agree that it has. In a building that looks alike turned false closures "
-        f"agree so, too: if no step of the odometry can be off by that much, {remedy}.",
+        f"{slipped}: closures agree on that. False closures in a building that looks the same after a turn would agree "
+        f"in the same way: if no step of the odometry can be off by that much, {remedy}.",
     )
 
 
@@ -57,12 +57,12 @@ def _of_mounting(mode: Mode) -> tuple[str, ...]:
     if not mounting.any():
         return ()
     about_one = mode.problem.components == 1
-    unknown = " (and by any turn about the axis of all turns, which none of them tells)" if about_one else ""
+    unknown = " (a further turn about the axis that all rotations share cannot be seen)" if about_one else ""
     return (
-        f"Closures agree once their sensor is held to be mounted {np.degrees(np.linalg.norm(mounting)):.0f}° otherwise "
-        f"than said: its orientation in the body's frame is {_in_body(mounting)}{unknown}. The answer is as if edges "
-        "had been turned so; if that is how the sensor sits, set edge_sensor_orientations to it, times what it is now, "
-        "or mend the transform or the edges. If it is not, solve without (neurora~mounting).",
+        f"Closures agree if their sensor is mounted {np.degrees(np.linalg.norm(mounting)):.0f}° differently from what "
+        f"is stated: its orientation in the body's frame is then {_in_body(mounting)}{unknown}. The answer assumes "
+        "that. If the sensor is mounted so, set edge_sensor_orientations to this orientation times the one that is set "
+        "now, or correct the transform or the edges. If it is not, solve without this correction (neurora~mounting).",
     )
 
 
@@ -72,10 +72,10 @@ def _of_suspected(mounting: np.ndarray | None) -> tuple[str, ...]:
         return ()
     degrees = np.degrees(np.linalg.norm(mounting))
     return (
-        f"Closures and odometry seem to turn about axes that differ by {degrees:.0f}°. If the closures' sensor is "
-        f"mounted otherwise than said, its orientation in the body's frame is {_in_body(mounting)}: set "
-        "edge_sensor_orientations to it, times what it is now, or mend the transform or the edges. It may as well be "
-        "odometry's own axes, so nothing was turned.",
+        f"Closures and odometry seem to turn about axes that differ by {degrees:.0f}°. Nothing was corrected, because "
+        "odometry's own axes may be wrong. If instead the closures' sensor is mounted differently from what is stated, "
+        f"its orientation in the body's frame is {_in_body(mounting)}: set edge_sensor_orientations to this "
+        "orientation times the one that is set now, or correct the transform or the edges.",
     )
 
 
