@@ -42,6 +42,6 @@ class Lost:
         if self.problem is not None:
             parts.append(self.problem)
             return "; ".join(parts)
-        left = sum(connection.msgcount for connection in reader.connections)
+        left = sum(connection.msgcount for connection in reader.connections) - len(self.undecodable)
         of_all = "" if self.expected is None else f" of {self.expected}"
         return "; ".join([*parts, f"{left}{of_all} messages can be read"])

@@ -140,7 +140,7 @@ def _load(path: Path) -> tuple[dict[str, np.ndarray], bool | None]:
             with np.load(file, allow_pickle=False) as archive:
                 names = sorted(archive.files)
                 arrays = {name: archive[name] for name in _SHAPES if name in names}
-                planar = bool(archive["planar"]) if "planar" in names else None
+                stated_planar = archive["planar"] if "planar" in names else None
         except Exception as error:  # a damaged archive can fail anywhere in zipfile, zlib or the array headers
             reason = " ".join(str(error).split())[:120] or type(error).__name__
             raise GraphFileError.at(path, None, f"not a readable npz archive of plain arrays: {reason}") from None
@@ -148,7 +148,16 @@ def _load(path: Path) -> tuple[dict[str, np.ndarray], bool | None]:
     if missing:
         has = ", ".join(names) or "nothing"
         raise GraphFileError.at(path, None, f"lacks {', '.join(missing)}; an npz view-graph needs them, this has {has}")
-    return {name: _checked(path, name, array) for name, array in arrays.items()}, planar
+    return {name: _checked(path, name, array) for name, array in arrays.items()}, _truth_value(path, stated_planar)
+
+
+def _truth_value(path: Path, planar: np.ndarray | None) -> bool | None:
+    if planar is None:
+        return None
+    if planar.size != 1 or planar.dtype.kind not in "biu":
+        what = f"planar holds {planar.dtype} of shape {planar.shape}; it must be one value, true or false"
+        raise GraphFileError.at(path, None, what)
+    return bool(planar.item())
 
 
 def _checked(path: Path, name: str, array: np.ndarray) -> np.ndarray:

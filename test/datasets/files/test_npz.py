@@ -108,6 +108,8 @@ def test_rgbd_scene(shared_data: Path) -> None:
         ),
         ({"node_ids": [10, 20, 40, -3]}, "node_ids holds -3; ids must be integers from 0"),
         ({"node_ids": [10, 20, 20, 40], "stamps_ns": [1, 2, 3, 4]}, "node_ids holds 20 more than once"),
+        ({"planar": [True, False]}, "planar holds bool of shape (2,); it must be one value, true or false"),
+        ({"planar": "no"}, "planar holds <U2 of shape (); it must be one value"),
         ({"planar": True, "target_from_source": [[0.6, 0, 0, 0.8]] * 2}, "declared planar"),
     ],
 )
