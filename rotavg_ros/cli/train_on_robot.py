@@ -15,11 +15,12 @@ import yaml
 from rotavg_ros.cli.convert import format_of
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files.ground_truth import attach_truth
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.results import make_folder
 from rotavg_ros.solver.learning.fine_tuning import SlamFineNet
 from rotavg_ros.solver.learning.robot_runs import RobotNoise, RobotRun
 from rotavg_ros.training.own_robot import Verdict, compare, family_of, fine_tune
+from rotavg_ros.wording import counted
 
 _LEAST_CLOSURES = 12
 _TRIED = "tried"
@@ -37,14 +38,16 @@ def run(arguments: argparse.Namespace) -> int:
     for name in ("config", "clean_net", "start"):
         if getattr(arguments, name) is not None:
             raise OwnRobotError(f"slam takes no {name.replace('_', '-')}: it begins with the package's network")
+    tried = arguments.output / _TRIED
+    with asking_about(tried, OwnRobotError):
+        is_taken = tried.exists()
+    if is_taken:  # told before the minutes that solving the runs takes
+        raise OwnRobotError(f"{tried}: is there from before; remove it or choose another --output")
     runs = [_read(path, truth) for path, truth in zip(arguments.runs, truths, strict=True)]
     noises = [each.noise() for each in runs]
     for path, noise in zip(arguments.runs, noises, strict=True):
         print(f"{path}: {_told(noise)}", flush=True)
     family = family_of(noises)
-    tried = arguments.output / _TRIED
-    if tried.exists():
-        raise OwnRobotError(f"{tried}: is there from before; remove it or choose another --output")
     make_folder(tried)
     plain = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(family).items()}
     configuration = {"family": "slam", "recipe": "robots", "robots": plain}
@@ -70,7 +73,8 @@ def _read(path: Path, truth: Path | None) -> RobotRun:
             graph_file = attach_truth(graph_file, truth)
         closures = int((~graph_file.graph.is_odometry).sum())
         if closures < _LEAST_CLOSURES or closures == graph_file.graph.num_edges:
-            raise OwnRobotError(f"{path}: has {closures} closures; need odometry and {_LEAST_CLOSURES} at least")
+            has = counted(closures, "closure")
+            raise OwnRobotError(f"{path}: has {has}; need odometry and {_LEAST_CLOSURES} closures at least")
         known = graph_file.body_from_world_gt if truth is not None else None
         if known is not None and not np.isfinite(known).all():
             raise OwnRobotError(f"{truth}: does not tell all orientations of {path}; leave it out")
