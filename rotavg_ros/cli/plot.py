@@ -26,6 +26,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Draw."""
     if arguments.output is not None and arguments.output.is_dir():
         raise PlotError(f"{arguments.output}: is a folder; give --output a picture's name in it, such as noise.png")
+    if arguments.output is not None and not arguments.output.suffix:
+        arguments.output = arguments.output.with_name(f"{arguments.output.name}.png")
     return _run_training(arguments) if arguments.kind == "training" else _run_statistics(arguments)
 
 
@@ -48,9 +50,7 @@ def _run_statistics(arguments: argparse.Namespace) -> int:
     if outlier_angle_deg is None:
         outlier_angle_deg = 10.0 if bool(graph.is_odometry.any()) else 20.0
     knows_truth = truth is not None and bool(np.isfinite(truth).all(axis=1).any())
-    output = arguments.output or Path(f"{stem_of(arguments.graph)}-statistics")
-    if not output.suffix:
-        output = output.with_name(f"{output.name}.png")
+    output = arguments.output or Path(f"{stem_of(arguments.graph)}-statistics.png")
     with working("solving and drawing"):
         noise = edge_noise(graph, torch.from_numpy(truth) if truth is not None and knows_truth else None)
         with _writing(output):

@@ -257,6 +257,9 @@ def test_plot_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     log.write_text("".join(f'{{"epoch": {epoch}, "validation_objective": {2 / (epoch + 1)}}}\n' for epoch in range(5)))
     assert main(["plot", "training", str(log), str(log), "--output", str(picture)]) == 0
     assert picture.read_bytes().startswith(b"\x89PNG")
+    assert main(["plot", "training", str(log), "--output", str(tmp_path / "other")]) == 0
+    assert capsys.readouterr().out.splitlines() == [str(picture), str(tmp_path / "other.png")]
+    assert (tmp_path / "other.png").exists()
     epochs, objective = read_log(log)
     np.testing.assert_allclose(epochs * objective, 2)
     log.write_text('{"epoch": 1}\n')
@@ -273,6 +276,14 @@ def test_names_in_pictures_are_no_mathematics(tmp_path: Path) -> None:
         picture = tmp_path / f"{kind}.png"
         assert main(["plot", kind, str(read), "--output", str(picture)]) == 0
         assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_picture_is_named_after_a_graph_with_dots_in_its_name(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("run.v2.g2o").write_text("EDGE_SE2 0 1 1 0 0.1 1 0 0 1 0 1\n")
+    assert main(["plot", "statistics", "run.v2.g2o"]) == 0
+    assert capsys.readouterr().out == "run.v2-statistics.png\n"
+    assert Path("run.v2-statistics.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("kind", ["statistics", "training"])
