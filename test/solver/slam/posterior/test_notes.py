@@ -24,4 +24,4 @@ def test_a_slip_that_other_odometry_tells_of_is_not_laid_to_closures() -> None:
     odometry = torch.full((78,), int(EdgeKind.ODOMETRY), dtype=torch.int8)
     graph = ViewGraph.create(first, first + 1, torch.cat([wheels, camera]), num_nodes=40, kind=odometry)
     (warning,) = solve(graph, profile="slam").warnings
-    assert "between nodes 20 and 21, because other odometry between the same nodes says so" in warning
+    assert "(between nodes 20 and 21): other odometry between the same nodes disagrees with it" in warning
