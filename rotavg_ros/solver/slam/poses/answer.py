@@ -104,13 +104,15 @@ def _precision(pose: PoseMode) -> np.ndarray:
     """
     problem, noise, drawn = pose.problem, pose.state.noise, pose.problem.drawn
     closure, edges = problem.mode.problem.closure, problem.closures
-    turn = drawn.edge_values(problem.mean_over_axes(1 / pose.solved.rotation_weight)) * problem.drawn_steps.share
+    mean_square = problem.even_turns.mean_square
+    turn = drawn.edge_values(problem.mean_over_axes(1 / pose.solved.rotation_weight) * mean_square)
+    turn *= problem.drawn_steps.share
     slipped = drawn.edge_values((drawn.is_odometry & ~problem.mode.state.is_good).astype(np.float64))
     slip = (problem.priors.slip * problem.typical) ** 2
     shift = noise.way * problem.lengths_passed + slipped * drawn.share_of_segment * slip
     if problem.jump is not None:
         shift += problem.jump
-    turn[edges] = 1 / pose.solved.rotation_weight[closure, 0]
+    turn[edges] = mean_square[closure] / pose.solved.rotation_weight[closure, 0]
     shift[edges] = 1 / pose.solved.closure_weight
     known = np.isfinite(problem.translation).all(axis=1)
     return np.asarray(np.stack((1 / turn, known / shift), axis=1))
@@ -156,9 +158,11 @@ def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
     problem, places, mode = pose.problem, pose.solved.places, pose.problem.mode
     predictions = pose.solved.predictions
     closure, k = mode.problem.closure, problem.turns
-    own = problem.closure_turns(pose.state.noise)
-    turn = np.sqrt((predictions.mean[:, :k] ** 2).sum(axis=1))
-    predicted = np.trace(predictions.covariance[:, :k, :k], axis1=1, axis2=2) / k
+    uneven = problem.told.uneven
+    own = problem.closure_turns(pose.state.noise) * problem.even_turns.mean_square[closure]
+    turn = np.sqrt((predictions.turn(uneven) ** 2).sum(axis=1))
+    covariance = uneven @ predictions.covariance[:, :k, :k] @ uneven
+    predicted = np.trace(covariance, axis1=1, axis2=2) / k
     part = own / (own + predicted)
     exceeds = exceedance(part * turn, part * predicted, OUTLIER_ANGLE, k)
     good = places.rotation_good

@@ -32,7 +32,7 @@ _WINDOW = 48
 
 @dataclass(frozen=True)
 class Predictions:
-    """Predictions of C closures' residuals by all else.
+    """Predictions of C closures' residuals by all else, with even turns.
 
     Attributes:
         mean: ``(C, k + m)`` μ, rad and metres.
@@ -41,6 +41,10 @@ class Predictions:
 
     mean: np.ndarray
     covariance: np.ndarray
+
+    def turn(self, uneven: np.ndarray) -> np.ndarray:
+        """``(C, k)`` rad, mean turns, given the maps ``(C, k, k)`` from even turns."""
+        return np.asarray(np.matmul(uneven, self.mean[:, : uneven.shape[1], None])[:, :, 0])
 
     def within(self, turns: int, turn: float, shift: np.ndarray) -> Predictions:
         """The predictions combined with the prior bounds on turns and shifts.
@@ -77,7 +81,9 @@ class Told:
     """What rotations alone say of C closures.
 
     Attributes:
-        rotation_variance: ``(C,)`` rad² per component, of a good closure's turn.
+        rotation_variance: ``(C,)`` rad² per component, of a good closure's even turn
+            (:mod:`rotavg_ros.solver.slam.poses.even_turns`).
+        uneven: ``(C, k, k)`` from a closure's even turn to its turn.
         false_odds: ``(C,)`` nats: log density of the turn if false, plus the prior log-odds of being false. Near misses
             have the prediction's variance added. For a labelled closure, only what that adds to the log density.
         is_known: ``(C,)`` bool, whether a translation is stated.
@@ -89,6 +95,7 @@ class Told:
     """
 
     rotation_variance: np.ndarray
+    uneven: np.ndarray
     false_odds: np.ndarray
     is_known: np.ndarray
     label: np.ndarray
@@ -221,8 +228,9 @@ def along_axes(predictions: Predictions, turns: int) -> tuple[np.ndarray, np.nda
     return along, np.maximum(spread, 0.0)
 
 
-def log_from_behind(predictions: Predictions, variance: np.ndarray, turns: int) -> np.ndarray:
+def log_from_behind(predictions: Predictions, uneven: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """``(C,)`` nats, log density of turns that are half a turn off, with noise of ``variance`` ``(C,)`` rad²."""
+    turns = uneven.shape[1]
     spread = np.trace(predictions.covariance[:, :turns, :turns], axis1=1, axis2=2) / turns
-    angle = np.minimum(np.sqrt((predictions.mean[:, :turns] ** 2).sum(axis=1)), np.pi)
+    angle = np.minimum(np.sqrt((predictions.turn(uneven) ** 2).sum(axis=1)), np.pi)
     return log_half_turn(angle, variance + spread, turns)

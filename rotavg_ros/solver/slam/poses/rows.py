@@ -18,6 +18,7 @@ from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.graph.routes import way_along
 from rotavg_ros.solver.slam.poses.closures import ANYHOW, NOTHING, Told
 from rotavg_ros.solver.slam.poses.displacements import Displacements, DrawnSteps
+from rotavg_ros.solver.slam.poses.even_turns import EvenTurns
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 from rotavg_ros.solver.slam.poses.state import PoseNoise, PoseState
 from rotavg_ros.solver.slam.posterior.densities import log_false, log_good
@@ -118,6 +119,13 @@ class PoseProblem:
         """``(k, k)`` projection of a turn onto the drift axis; the identity where there is none."""
         return np.eye(self.turns) if self.drift_axis is None else np.outer(self.drift_axis, self.drift_axis)
 
+    @cached_property
+    def even_turns(self) -> EvenTurns:
+        """Units in which the rows' turns err alike about all axes."""
+        if self.turns < 3 or "body-axes" in self.mode.problem.without:
+            return EvenTurns.alike(len(self.drawn.source), self.turns)
+        return EvenTurns.of(self.mode, odometry=self.drift_axis is None)
+
     @property
     def num_about(self) -> int:
         """Number of components of a turn about the drift axis; all of them where there is none."""
@@ -125,7 +133,8 @@ class PoseProblem:
 
     def mean_turn(self, noise: PoseNoise) -> float:
         """rad², variance of one step of odometry, averaged over components."""
-        return float(self.mean_over_axes(np.array([noise.turn, noise.tilt])))
+        of_even = float(self.mean_over_axes(np.array([noise.turn, noise.tilt])))
+        return of_even * float(self.even_turns.mean_square[: self.drawn.num_segments].mean())
 
     def mean_over_axes(self, variance: np.ndarray) -> np.ndarray:
         """Variances about the drift axis and any other one, ``(…, 2)`` → their mean over components, ``(…)``."""
@@ -222,7 +231,7 @@ class PoseProblem:
     def turn_variances(self, noise: PoseNoise) -> np.ndarray:
         """``(E, 2)`` rad² about the drift axis and any other one, tails as the last solve weighed them.
 
-        For odometry as labelled; for closures as good ones, which err alike about all axes.
+        Of even turns; for odometry as labelled, for closures as good ones.
         """
         state, priors, is_odometry = self.mode.state, self.mode.problem.priors, self.drawn.is_odometry
         steps = np.array([[noise.turn, noise.tilt]]) / state.noise.step_variance
@@ -295,7 +304,8 @@ class PoseProblem:
         is_known = np.isfinite(self.translation).all(axis=1)[self.closures]
         own = self.closure_turns(self.turn_noise)
         order = problem.detection, problem.detected
-        return Told(own, false_odds, is_known, label, problem.run, problem.follows, problem.sign, *order)
+        uneven = self.even_turns.uneven[closure]
+        return Told(own, uneven, false_odds, is_known, label, problem.run, problem.follows, problem.sign, *order)
 
     @cached_property
     def equations(self) -> BlockEquations:
@@ -338,16 +348,17 @@ class PoseProblem:
         return np.asarray(np.stack(from_root, axis=1)[drawn.nodes])
 
     def residuals(self, state: PoseState, way: Displacements) -> np.ndarray:
-        """``(E + R, k + m)`` measured minus predicted."""
+        """``(E + R, k + m)`` measured minus predicted, with even turns."""
         drawn, (turns, shifts) = self.drawn, self.bases
         measured = self.mode.problem.measured
         turn = quaternion_rows.residual_vectors(state.correction, measured, drawn.source, drawn.target)
         shift = way.displacement - (state.position[drawn.target] - state.position[drawn.source])
-        both = np.concatenate((turn, shift), axis=1)
+        even = np.matmul(self.even_turns.even, (turn @ turns)[:, :, None])[:, :, 0]
+        both = np.concatenate((even, shift @ shifts), axis=1)
+        common = np.concatenate((state.common[:, :3] @ turns, state.common[:, 3:] @ shifts), axis=1)
         shared = np.flatnonzero(self.run >= 0)
-        both[shared] -= self.sign[shared, None] * state.common[self.run[shared]]
-        both = np.concatenate((both, -state.common))
-        return np.concatenate((both[:, :3] @ turns, both[:, 3:] @ shifts), axis=1)
+        both[shared] -= self.sign[shared, None] * common[self.run[shared]]
+        return np.concatenate((both, -common))
 
     def jacobian(self, way: Displacements) -> np.ndarray:
         """``(E + R, d, 3 d)`` by the blocks of target, source and run."""
@@ -356,6 +367,7 @@ class PoseProblem:
         rows = np.zeros((num_edges + self.num_runs, d, 3 * d))
         edges, unit = rows[:num_edges], np.eye(d)
         edges[:, :, :d], edges[:, :, d : 2 * d] = unit, -unit
+        edges[:, :k, :k], edges[:, :k, d : d + k] = self.even_turns.even, -self.even_turns.even
         edges[:, k:, :k] = -self._crossed(way.at_target)
         edges[:, k:, d : d + k] = -self._crossed(way.at_source)
         edges[:, :, 2 * d :] = self.sign[:, None, None] * unit

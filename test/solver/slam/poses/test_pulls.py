@@ -19,6 +19,7 @@ def told(count: int) -> Told:
     each = np.arange(count)
     return Told(
         rotation_variance=np.full(count, 1e-4),
+        uneven=np.ones((count, 1, 1)),
         false_odds=np.zeros(count),
         is_known=np.ones(count, dtype=bool),
         label=np.zeros(count),

@@ -90,7 +90,9 @@ class Judge:
         self, said: Said, maps: MapTurns, before: np.ndarray, log_alone: np.ndarray, *, in_order: bool
     ) -> Repeats:
         told, scale, predictions = self.told, said.scale, said.predictions
-        turn, shift = np.split(told.sign[:, None] * predictions.mean, [self.turns], axis=1)
+        turn, shift = (
+            told.sign[:, None] * each for each in (predictions.turn(told.uneven), predictions.mean[:, self.turns :])
+        )
         tells = predictions.tell(self.turns, scale.extent)
         errors = Errors(turn, shift, told.rotation_variance, np.full(len(turn), scale.closure), tells)
         alone = np.exp(log_alone) * self._could_be(before[:-1].sum(axis=0), 1)
@@ -143,7 +145,7 @@ class Judge:
         log_nobodys, log_elsewhere = self._log_elsewhere(anywhere, by_itself, wrong, in_turn)
         elsewhere = np.logaddexp(by_itself + log_nobodys, log_elsewhere)
         behind = log_alone + np.log(priors.from_behind) + said.log_anywhere
-        log_behind = log_from_behind(said.predictions, said.turned[1], self.turns)
+        log_behind = log_from_behind(said.predictions, told.uneven, said.turned[1])
         return np.logaddexp(log_alone + elsewhere, log_repeat), log_behind + np.logaddexp(behind, log_repeat)
 
     def _could_be(self, chance: np.ndarray, label: int) -> np.ndarray:

@@ -55,15 +55,15 @@ class MapTurns:
         k, m = turns.shape[1], shifts.shape[1]
         is_forward = problem.told.sign > 0
         # A correction turns body_from_world; the map turns by its inverse.
-        turn = quaternion_rows.exp(-turns @ predictions.mean[:, :k].T)
+        turn = quaternion_rows.exp(-turns @ predictions.turn(problem.told.uneven).T)
         shift = predictions.mean[:, k:] @ shifts.T
         change = np.zeros((len(closure), k + m, k + m))
-        change[:, :k, :k], change[:, k:, k:] = -np.eye(k), np.eye(m)
+        change[:, :k, :k], change[:, k:, k:] = -problem.told.uneven, np.eye(m)
         # If the newer end is the source: the inverse, F⁻¹. Translations are in the older end's frame in any case.
         is_back = np.flatnonzero(~is_forward)
         inverse = quaternion_rows.inverse(turn[:, is_back])
         turn[:, is_back], shift[is_back] = inverse, -shift[is_back]
-        change[is_back, :k, :k] = turns.T @ quaternion_rows.matrices(inverse) @ turns
+        change[is_back, :k, :k] = turns.T @ quaternion_rows.matrices(inverse) @ turns @ problem.told.uneven[is_back]
         change[is_back, k:, k:] *= -1
         own = np.repeat(np.stack((problem.told.rotation_variance, closure_variance), axis=1), (k, m), axis=1)
         noise = own[:, :, None] * np.eye(k + m)
