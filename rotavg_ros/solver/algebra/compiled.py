@@ -43,7 +43,8 @@ class _Compiled(Generic[Function]):
                 called = function.__globals__.get(name)
                 if isinstance(called, _Compiled):
                     function.__globals__[name] = called.dispatcher
-            made: Any = numba.njit(nogil=True, error_model="numpy")(function)
+            njit: Any = numba.njit  # its types lack the last option: no C code calls a kernel
+            made = njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function)
             with suppress(RuntimeError):  # neither folder can be written to: it is compiled in every process
                 made._cache = _kept(function)
             self._dispatcher = cast(Function, made)

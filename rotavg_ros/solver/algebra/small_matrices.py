@@ -49,17 +49,22 @@ def inverse(matrices: np.ndarray) -> np.ndarray:
     return np.asarray(np.matmul(root.transpose(0, 2, 1), root))
 
 
-@compiled
 def eigh(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Eigenvalues ``(n, k)`` in no order, and unit eigenvectors ``(n, k, k)`` in columns, by Jacobi rotations."""
+    return _eigh(np.ascontiguousarray(matrices))
+
+
+@compiled
+def _eigh(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     count, size, _ = matrices.shape
     value, vector = np.empty((count, size)), np.zeros((count, size, size))
     left = np.empty((size, size))
     for n in range(count):
         own = vector[n]
-        left[:] = matrices[n]
         for i in range(size):
             own[i, i] = 1.0
+            for j in range(size):
+                left[i, j] = matrices[n, i, j]
         for _ in range(_ROUNDS):
             is_diagonal = True
             for p in range(size - 1):

@@ -96,7 +96,7 @@ class Elimination:
         factor_begin = np.append(0, np.cumsum(counts))
         factor_row = factor_rows(begin, row, above, factor_begin)
         spend(_BLOCK * num_blocks)
-        fronts = Fronts(*merged(above, counts, factor_begin, factor_row, size))
+        fronts = merged(above, counts, factor_begin, factor_row, size)
         self.rank = fronts.place[order]
         spend(_BLOCK * num_blocks)
         lower, upper = np.minimum(self.rank[first], self.rank[second]), np.maximum(self.rank[first], self.rank[second])
@@ -142,7 +142,7 @@ class Elimination:
         """Find the stretches, and count their work."""
         products = merging.products(pivots, rows)
         is_dense = products > merging.DENSE
-        units = merging.seconds(pivots, rows) / _UNIT_S
+        units = merging.seconds(products, pivots, rows) / _UNIT_S
         number = _stretch(units * _UNIT_S, is_dense, _REST_S)
         first = np.flatnonzero(np.diff(number, prepend=-1))
         each = np.add.reduceat(units, first)

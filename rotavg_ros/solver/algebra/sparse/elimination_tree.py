@@ -17,10 +17,9 @@ def elimination_tree(begin: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np
         begin, row: the matrix's upper triangle by columns, in the order of elimination.
     """
     size = len(begin) - 1
-    above, seen = np.full(size, _NOWHERE, np.int32), np.empty(size, np.int32)
-    count = np.zeros(size, np.int64)
+    above, seen, count = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int64)
     for k in range(size):
-        seen[k] = k
+        above[k], seen[k], count[k] = _NOWHERE, k, 0
         for at in range(begin[k], begin[k + 1]):
             i = row[at]
             while seen[i] != k:
@@ -36,10 +35,10 @@ def elimination_tree(begin: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np
 def factor_rows(begin: np.ndarray, row: np.ndarray, above: np.ndarray, factor_begin: np.ndarray) -> np.ndarray:
     """Rows of L's entries, ascending in each column."""
     size = len(above)
-    factor_row, free = np.empty(factor_begin[-1], np.int32), factor_begin[:-1].copy()
-    seen = np.empty(size, np.int32)
+    factor_row = np.empty(factor_begin[-1], np.int32)
+    free, seen = np.empty(size, np.int64), np.empty(size, np.int32)
     for k in range(size):
-        seen[k] = k
+        free[k], seen[k] = factor_begin[k], k
         for at in range(begin[k], begin[k + 1]):
             i = row[at]
             while seen[i] != k:

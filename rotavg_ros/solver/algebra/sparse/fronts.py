@@ -131,7 +131,8 @@ def eliminate(shape: Shape, first: int, last: int, room: Room, top: int) -> int:
                 _take(own[k, k:], own, k, begin, end)
             for i in range(num_rows):
                 _take(left[i, i:], own, num_pivots + i, begin, end)
-        room.stack[top : top + num_rows * num_rows] = room.work[: num_rows * num_rows]
+        for i in range(num_rows * num_rows):
+            room.stack[top + i] = room.work[i]
         top += num_rows * num_rows
     return top
 
@@ -211,7 +212,8 @@ def invert(shape: Shape, first: int, last: int, room: Room, top: int) -> int:
         found = room.work[: width * width].reshape(width, width)
         top -= num_rows * num_rows
         for i in range(num_rows):
-            found[num_pivots + i, num_pivots:] = room.stack[top + i * num_rows : top + (i + 1) * num_rows]
+            for j in range(num_rows):
+                found[num_pivots + i, num_pivots + j] = room.stack[top + i * num_rows + j]
         for j in range(num_pivots - 1, -1, -1):
             line, to = own[j], found[j, j + 1 :]
             to[:] = 0.0

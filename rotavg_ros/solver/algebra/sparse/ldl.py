@@ -199,18 +199,25 @@ def _ties(column: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return first, second
 
 
-@compiled
 def _lay_out(column: np.ndarray, value: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """H's upper triangle by columns, each beginning with the diagonal; and positions of pairs of a row's unknowns."""
-    count = np.zeros(size + 1, np.int64)
+    begin, row, slot = _listed(column, value, size)
+    return begin, row[: begin[-1]].copy(), slot.reshape(len(column), 6)
+
+
+@compiled
+def _listed(column: np.ndarray, value: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same as :func:`_lay_out`, with room to spare for rows."""
+    first, free = np.zeros(size + 1, np.int64), np.empty(size, np.int64)
     for e in range(len(column)):
         for a in range(3):
             for b in range(a):
                 if value[e, a] != 0 and value[e, b] != 0:
-                    count[max(column[e, a], column[e, b]) + 1] += 1
-    first = np.cumsum(count)
+                    first[max(column[e, a], column[e, b]) + 1] += 1
+    for j in range(size):
+        free[j] = first[j]
+        first[j + 1] += first[j]
     pair, other = np.empty(first[-1], np.int64), np.empty(first[-1], np.int32)
-    free = first[:-1].copy()
     for e in range(len(column)):
         for a in range(3):
             for b in range(a):
@@ -221,8 +228,7 @@ def _lay_out(column: np.ndarray, value: np.ndarray, size: int) -> tuple[np.ndarr
                     free[j] += 1
     begin = np.zeros(size + 1, np.int64)
     row = np.empty(first[-1] + size, np.int32)
-    slot = np.full(6 * len(column), _NOWHERE, np.int64)
-    place = np.full(size, _NOWHERE, np.int64)
+    slot, place = np.full(6 * len(column), _NOWHERE), np.full(size, _NOWHERE)
     end = 0
     for j in range(size):
         row[end] = j
@@ -240,7 +246,7 @@ def _lay_out(column: np.ndarray, value: np.ndarray, size: int) -> tuple[np.ndarr
         for a in range(3):
             if value[e, a] != 0:
                 slot[6 * e + a] = begin[column[e, a]]
-    return begin, row[:end].copy(), slot.reshape(len(column), 6)
+    return begin, row, slot
 
 
 @compiled

@@ -43,12 +43,11 @@ def factorise(shape: Shape, entries: np.ndarray, full: int) -> tuple[np.ndarray,
     size = len(above)
     lower, diagonal = np.empty(len(factor_row)), np.empty(size)
     remaining = np.zeros((size - full, size - full))
-    free = factor_begin[:-1].copy()
     # Row k of L solves L₁ D₁ l = h with the rows before it; it has entries only on paths up the tree, in that order.
     work, seen = np.zeros(size), np.empty(size, np.int32)
-    way, waiting = np.empty(size, np.int32), np.empty(size, np.int32)
+    way, waiting, free = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int64)
     for k in range(size):
-        seen[k] = k
+        seen[k], free[k] = k, factor_begin[k]
         top = size
         for at in range(begin[k], begin[k + 1]):
             i = row[at]
@@ -136,7 +135,7 @@ def selected_inverse(
     _, _, _, factor_begin, factor_row, full = shape
     size = len(diagonal)
     own, inverse = np.empty(size), np.empty(len(lower))
-    place, total = np.full(size, _NOWHERE, np.int64), np.empty(size)
+    place, total = np.full(size, _NOWHERE), np.empty(size)
     for j in range(full, size):
         own[j] = whole[j - full, j - full]
         for at in range(factor_begin[j], factor_begin[j + 1]):
@@ -172,18 +171,30 @@ def selected_inverse(
 
 
 @compiled
+def _first_from(row: np.ndarray, begin: int, end: int, least: int) -> int:
+    """The first of these positions whose row, ascending, is not less than ``least``; ``end`` if there is none."""
+    while begin < end:
+        middle = (begin + end) // 2
+        if row[middle] < least:
+            begin = middle + 1
+        else:
+            end = middle
+    return begin
+
+
+@compiled
 def is_near(shape: Shape, column: np.ndarray, value: np.ndarray) -> np.ndarray:
     """``(n,)`` bool, whether all pairs of a row's unknowns are entries of L."""
     _, _, _, factor_begin, factor_row, _ = shape
-    near = np.ones(len(column), np.bool_)
+    near = np.empty(len(column), np.bool_)
     for e in range(len(column)):
+        near[e] = True
         for a in range(3):
             for b in range(a):
                 if value[e, a] != 0 and value[e, b] != 0:
                     i, j = max(column[e, a], column[e, b]), min(column[e, a], column[e, b])
-                    first, end = factor_begin[j], factor_begin[j + 1]
-                    at = first + np.searchsorted(factor_row[first:end], i)
-                    if at == end or factor_row[at] != i:
+                    at = _first_from(factor_row, factor_begin[j], factor_begin[j + 1], i)
+                    if at == factor_begin[j + 1] or factor_row[at] != i:
                         near[e] = False
     return near
 
@@ -204,7 +215,7 @@ def row_variance(
             for b in range(a):
                 if value[e, b] != 0:
                     i, j = max(column[e, a], column[e, b]), min(column[e, a], column[e, b])
-                    at = factor_begin[j] + np.searchsorted(factor_row[factor_begin[j] : factor_begin[j + 1]], i)
+                    at = _first_from(factor_row, factor_begin[j], factor_begin[j + 1], i)
                     total += 2 * value[e, a] * value[e, b] * inverse[at]
         variance[e] = total
     return variance
@@ -222,7 +233,7 @@ def far_variance(
     _, _, above, factor_begin, factor_row, full = shape
     size = len(above)
     variance, work = np.zeros(len(column)), np.zeros((size, _AT_ONCE))
-    way, seen = np.empty(size, np.int64), np.full(size, _NOWHERE, np.int64)
+    way, path, seen = np.empty(size, np.int64), np.empty(size, np.int64), np.full(size, _NOWHERE)
     left, remaining = np.empty(_AT_ONCE), np.empty((len(column), size - full))
     for first in range(0, len(column), _AT_ONCE):
         last, count = min(first + _AT_ONCE, len(column)), 0
@@ -231,13 +242,17 @@ def far_variance(
                 j = column[e, a]
                 if value[e, a] != 0:
                     work[j, e - first] += value[e, a]
+                    length = 0
                     while j != _NOWHERE and j < full and seen[j] != first:
                         seen[j] = first
-                        way[count] = j
-                        count += 1
+                        path[length] = j
+                        length += 1
                         j = above[j]
+                    count += length
+                    _merge_in(path[:length], way[:count])
         # What comes later in the order never leads back to what was before.
-        for j in np.sort(way[:count]):
+        for place in range(count):
+            j = way[place]
             for c in range(_AT_ONCE):
                 left[c] = work[j, c]
                 work[j, c] = 0.0
@@ -252,6 +267,20 @@ def far_variance(
                 remaining[e, j - full] = work[j, e - first]
                 work[j, e - first] = 0.0
     return variance, remaining
+
+
+@compiled
+def _merge_in(path: np.ndarray, way: np.ndarray) -> None:
+    """Merge a path, ascending, into ``way``, ascending, which has room for it at the end."""
+    last, to = len(path) - 1, len(way) - 1
+    while last >= 0:
+        before = to - last - 1
+        if before >= 0 and way[before] > path[last]:
+            way[to] = way[before]
+        else:
+            way[to] = path[last]
+            last -= 1
+        to -= 1
 
 
 @compiled

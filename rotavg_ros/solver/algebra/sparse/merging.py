@@ -6,7 +6,7 @@ its children where that costs less than eliminating them separately.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,8 @@ _FRONT_S, _PRODUCTS_PER_S, _MOVES_PER_S = 1.5e-6, 3e9, 5e8
 # From this number of multiplications on, products of whole matrices take less time; their multiplications per second.
 DENSE, _DENSE_PER_S = 4e5, 2.5e10
 _NOWHERE = -1
+
+Numbers = TypeVar("Numbers", float, np.ndarray)
 
 
 class Fronts(NamedTuple):
@@ -38,20 +40,20 @@ class Fronts(NamedTuple):
     within: np.ndarray
 
 
-@compiled
-def products(pivots: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Number of multiplications to eliminate ``pivots`` that are tied to ``rows``."""
-    number: np.ndarray = pivots * pivots * pivots / 6 + pivots * pivots * rows / 2 + pivots * rows * rows / 2
+def products(pivots: Numbers, rows: Numbers) -> Numbers:
+    """Number of multiplications to eliminate ``pivots`` that are tied to ``rows``; of one front, or of many."""
+    number: Numbers = pivots * pivots * pivots / 6 + pivots * pivots * rows / 2 + pivots * rows * rows / 2
     return number
 
 
-@compiled
-def seconds(pivots: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Seconds that fronts of ``pivots`` and ``rows`` take."""
-    number = products(pivots, rows)
-    rate = np.where(number > DENSE, _DENSE_PER_S, _PRODUCTS_PER_S)
-    taken: np.ndarray = _FRONT_S + number / rate + (rows * rows + pivots * (pivots + rows)) / _MOVES_PER_S
+def seconds(number: Numbers, pivots: Numbers, rows: Numbers) -> Numbers:
+    """Seconds that this ``number`` of multiplications takes, with all else that a front needs; likewise."""
+    rate = _PRODUCTS_PER_S + (number > DENSE) * (_DENSE_PER_S - _PRODUCTS_PER_S)
+    taken: Numbers = _FRONT_S + number / rate + (rows * rows + pivots * (pivots + rows)) / _MOVES_PER_S
     return taken
+
+
+_products, _seconds = compiled(products), compiled(seconds)
 
 
 class _Tree(NamedTuple):
@@ -74,38 +76,32 @@ class _Tree(NamedTuple):
     beside: np.ndarray
 
 
-@compiled
 def merged(
     above: np.ndarray, counts: np.ndarray, factor_begin: np.ndarray, factor_row: np.ndarray, size: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Fronts of L's pattern in blocks: see :class:`Fronts`."""
-    of_column, tree = _supernodes(above, counts)
-    num_nodes = len(tree.first)
-    cost = np.empty(num_nodes)
-    for s in range(num_nodes):
-        cost[s] = _cost(tree.pivots[s], tree.rows[s], size)
-        _take_in(tree, s, cost, size)
-        if tree.rows[s] > 0:
-            parent = of_column[factor_row[factor_begin[tree.last[s]]]]
-            tree.beside[s] = tree.below[parent]
-            tree.below[parent] = s
+) -> Fronts:
+    """Fronts of L's pattern in blocks of ``size`` unknowns."""
+    num_blocks = len(above)
+    of_column, first = _supernodes(above, counts)
+    count, last = len(first), np.append(first[1:], num_blocks) - 1
+    rows, nowhere = counts[last], np.full((3, len(first)), _NOWHERE)
+    tree = _Tree(first, last, last - first + 1, rows, np.arange(count), *nowhere)
+    parent = np.full(count, _NOWHERE)
+    parent[rows > 0] = of_column[factor_row[factor_begin[last[rows > 0]]]]
+    # Those of many rows are absorbed first.
+    child = np.lexsort((-np.arange(count), -rows, parent))
+    _merge(tree, np.searchsorted(parent[child], np.arange(count + 1)), child, size)
     order = _upwards(tree)
-    place, begin, over = _laid_out(tree, order, len(above))
-    row_begin = np.zeros(len(order) + 1, np.int64)
-    for f in range(len(order)):
-        row_begin[f + 1] = row_begin[f] + tree.rows[order[f]]
-    row = np.empty(row_begin[-1], np.int64)
-    for f in range(len(order)):
-        column = tree.last[order[f]]
-        for i in range(tree.rows[order[f]]):
-            row[row_begin[f] + i] = place[factor_row[factor_begin[column] + i]]
-        row[row_begin[f] : row_begin[f + 1]].sort()
-    return place, begin, over, row_begin, row, _within(begin, over, row_begin, row)
+    place, begin, over = _laid_out(tree, order, num_blocks)
+    front = np.repeat(np.arange(len(order)), rows[order])
+    row_begin = np.append(0, np.cumsum(rows[order]))
+    entry = factor_begin[last[order]][front] + np.arange(len(front)) - row_begin[front]
+    row = np.sort(front * num_blocks + place[factor_row[entry]]) - front * num_blocks
+    return Fronts(place, begin, over, row_begin, row, _within(begin, over, row_begin, row))
 
 
 @compiled
-def _supernodes(above: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, _Tree]:
-    """Supernode of each column ``(B,)``, and the supernodes: columns tied to the same later ones."""
+def _supernodes(above: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Supernode of each column ``(B,)``; and first column of each supernode, whose columns have the same rows."""
     num_blocks = len(above)
     num_below = np.zeros(num_blocks, np.int64)
     for j in range(num_blocks):
@@ -119,55 +115,39 @@ def _supernodes(above: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, _Tre
             first[count] = j
             count += 1
         of_column[j] = count - 1
-    last, pivots, rows = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
-    for s in range(count):
-        last[s] = (first[s + 1] if s + 1 < count else num_blocks) - 1
-        pivots[s], rows[s] = last[s] - first[s] + 1, counts[last[s]]
-    nowhere = np.full((3, count), _NOWHERE)
-    lists = np.arange(count), nowhere[0], nowhere[1], nowhere[2]
-    return of_column, _Tree(first[:count], last, pivots, rows, *lists)
+    return of_column, first[:count]
+
+
+@compiled
+def _merge(tree: _Tree, child_begin: np.ndarray, child: np.ndarray, size: int) -> None:
+    """Absorb children that would cost more by themselves, in this order; every front's children come before it."""
+    cost = np.empty(len(tree.first))
+    for s in range(len(tree.first)):
+        cost[s] = _cost(tree.pivots[s], tree.rows[s], size)
+        for at in range(child_begin[s], child_begin[s + 1]):
+            each = child[at]
+            together = _cost(tree.pivots[s] + tree.pivots[each], tree.rows[s], size)
+            if together < cost[s] + cost[each]:
+                cost[s] = together
+                tree.pivots[s] += tree.pivots[each]
+                tree.follows[each] = tree.head[s]
+                tree.head[s] = tree.head[each]
+                grandchild = tree.below[each]
+                while grandchild >= 0:
+                    following = tree.beside[grandchild]
+                    tree.beside[grandchild] = tree.below[s]
+                    tree.below[s] = grandchild
+                    grandchild = following
+            else:
+                tree.beside[each] = tree.below[s]
+                tree.below[s] = each
 
 
 @compiled
 def _cost(pivots: int, rows: int, size: int) -> float:
     """Seconds that a front takes, given blocks of ``size`` unknowns."""
-    taken: float = seconds(np.array([size * pivots]), np.array([size * rows]))[0]
-    return taken
-
-
-@compiled
-def _take_in(tree: _Tree, s: int, cost: np.ndarray, size: int) -> None:
-    """Absorb children that would cost more by themselves, those of many rows first."""
-    below = _listed(tree, tree.below[s])
-    tree.below[s] = _NOWHERE
-    for at in np.argsort(-tree.rows[below], kind="mergesort"):
-        child = below[at]
-        together = _cost(tree.pivots[s] + tree.pivots[child], tree.rows[s], size)
-        if together < cost[s] + cost[child]:
-            cost[s] = together
-            tree.pivots[s] += tree.pivots[child]
-            tree.follows[child] = tree.head[s]
-            tree.head[s] = tree.head[child]
-            for grandchild in _listed(tree, tree.below[child]):
-                tree.beside[grandchild] = tree.below[s]
-                tree.below[s] = grandchild
-        else:
-            tree.beside[child] = tree.below[s]
-            tree.below[s] = child
-
-
-@compiled
-def _listed(tree: _Tree, first: int) -> np.ndarray:
-    """``(n,)`` a front and its later siblings."""
-    many, each = 0, first
-    while each >= 0:
-        many += 1
-        each = tree.beside[each]
-    listed, each = np.empty(many, np.int64), first
-    for at in range(many):
-        listed[at] = each
-        each = tree.beside[each]
-    return listed
+    number = _products(size * pivots, size * rows)
+    return _seconds(number, size * pivots, size * rows)
 
 
 @compiled
@@ -175,7 +155,7 @@ def _upwards(tree: _Tree) -> np.ndarray:
     """``(F,)`` fronts in postorder."""
     count = len(tree.first)
     order, waiting = np.empty(count, np.int64), np.empty(count, np.int64)
-    num_fronts, end = 0, 0
+    begin, end = count, 0
     for s in range(count):
         if tree.rows[s] == 0:
             waiting[end] = s
@@ -183,27 +163,23 @@ def _upwards(tree: _Tree) -> np.ndarray:
     while end > 0:
         end -= 1
         s = waiting[end]
-        order[num_fronts] = s
-        num_fronts += 1
+        begin -= 1
+        order[begin] = s
         child = tree.below[s]
         while child >= 0:
             waiting[end] = child
             end += 1
             child = tree.beside[child]
-    return order[:num_fronts][::-1]
+    return order[begin:]
 
 
 @compiled
 def _laid_out(tree: _Tree, order: np.ndarray, num_blocks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Position of each block ``(B,)``, first pivot of each front ``(F + 1,)``, and parent of each front ``(F,)``."""
-    place, begin, over = (
-        np.empty(num_blocks, np.int64),
-        np.zeros(len(order) + 1, np.int64),
-        np.full(len(order), _NOWHERE),
-    )
-    number, at = np.full(len(tree.first), _NOWHERE), 0
+    place, begin = np.empty(num_blocks, np.int64), np.zeros(len(order) + 1, np.int64)
+    over, number, at = np.empty(len(order), np.int64), np.empty(len(tree.first), np.int64), 0
     for f in range(len(order)):
-        number[order[f]] = f
+        number[order[f]], over[f] = f, _NOWHERE
         part = tree.head[order[f]]
         while True:
             for j in range(tree.first[part], tree.last[part] + 1):

@@ -8,6 +8,7 @@ turn.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -81,7 +82,8 @@ def repeats(closures: Closures, near: Near, gap: float, components: int) -> Repe
         gap: steps; ends at most this far apart are near each other.
         components: k.
     """
-    return Repeats(*_repeats(closures, near, gap, _Kernels.of(components)))
+    density, total = _repeats(closures, near, gap, _Kernels.of(components))
+    return Repeats(density, total > 0)
 
 
 class _Kernels(NamedTuple):
@@ -159,7 +161,7 @@ def _repeats(closures: Closures, compared: Near, gap: float, kernels: _Kernels) 
                 cosine = abs(real - axis if is_inverse else real + axis)
                 if cosine <= least_cosine:
                     continue
-                kernel = np.exp(broadest * (2 * np.arccos(min(cosine, 1.0))) ** 2)
+                kernel = math.exp(broadest * (2 * math.acos(min(cosine, 1.0))) ** 2)
                 for s in range(widths - 1, -1, -1):
                     of_one[s] = kernel
                     kernel = (kernel * kernel) ** 2  # half as wide: the fourth power
@@ -171,4 +173,4 @@ def _repeats(closures: Closures, compared: Near, gap: float, kernels: _Kernels) 
             for s in range(widths):
                 density[whose, s, n] = summed[whose, s] * height[s] / max(total[whose, n], 1.0)
                 density[whose, widths, n] += density[whose, s, n] / widths
-    return density, total > 0
+    return density, total

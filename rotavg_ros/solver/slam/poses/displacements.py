@@ -241,7 +241,8 @@ def _walk(
     for s in range(len(steps.first) - 1):
         begin, end = steps.first[s], steps.first[s + 1]
         own = at_source[s]
-        own[:] = 0.0
+        for i in range(3):
+            own[i], passed[i], arm[i] = 0.0, 0.0, 0.0
         for p in range(begin, end):
             for i in range(3):
                 own[i] += (1 - steps.measured_at[p]) * world[p, i]
@@ -249,8 +250,6 @@ def _walk(
                 if are_several:
                     own[i] -= steps.share[p] * lag[p, i]
                     at_target[s, i] += steps.share[p] * lag[p, i]
-        passed[:] = 0.0
-        arm[:] = 0.0
         for p in range(begin, end):
             for i in range(3):
                 before = passed[i]
@@ -269,5 +268,5 @@ def _walk(
                         bridge[s, i, i] += steps.variance[p] * spread[p, j, j]
                         bridge[s, i, j] -= steps.variance[p] * spread[p, i, j]
             if not steps.is_last[p]:
-                lever[steps.node[p]] = arm
-                way[steps.node[p]] = passed
+                for i in range(3):
+                    lever[steps.node[p], i], way[steps.node[p], i] = arm[i], passed[i]

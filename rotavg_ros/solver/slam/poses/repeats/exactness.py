@@ -85,21 +85,43 @@ def shared_ways(kernels: np.ndarray, beforehand: np.ndarray, tells: np.ndarray, 
         told: which others are evidence.
     """
     count, ways = kernels.shape
-    number, in_run = beforehand.copy(), np.zeros((told.run.max() + 1 if count else 0, ways))
-    own, likely = np.zeros((count, ways)), np.empty((count, ways))
+    num_runs = 0
+    for c in range(count):
+        num_runs = max(num_runs, told.run[c] + 1)
+    number, in_run = np.empty(ways), np.zeros((num_runs, ways))
+    for way in range(ways):
+        number[way] = beforehand[way]
+    own, likely, each = np.zeros((count, ways)), np.empty((count, ways)), np.empty(ways)
     for c in told.order:
-        run = told.run[c]
-        likely[c] = (number / number.sum() + in_run[run]) / (1 + in_run[run].sum())
-        each = likely[c] * kernels[c]
-        if each.sum() > 0:
-            own[c] = tells[c] * (each / each.sum())
-            number += own[c]
-            in_run[run] += own[c]
+        of_run = in_run[told.run[c]]
+        _fill_shares(number, of_run, likely[c])
+        total = 0.0
+        for way in range(ways):
+            each[way] = likely[c, way] * kernels[c, way]
+            total += each[way]
+        if total > 0:
+            for way in range(ways):
+                own[c, way] = tells[c] * (each[way] / total)
+                number[way] += own[c, way]
+                of_run[way] += own[c, way]
     if not told.by_those_before:
+        others, of_others = np.empty(ways), np.empty(ways)
         for c in range(count):
-            others, of_run = number - own[c], in_run[told.run[c]] - own[c]
-            likely[c] = (others / others.sum() + of_run) / (1 + of_run.sum())
+            for way in range(ways):
+                others[way], of_others[way] = number[way] - own[c, way], in_run[told.run[c], way] - own[c, way]
+            _fill_shares(others, of_others, likely[c])
     return likely
+
+
+@compiled
+def _fill_shares(number: np.ndarray, of_run: np.ndarray, share: np.ndarray) -> None:
+    """``(W,)`` probability of each way, given the number of closures anywhere and in the run, which count as one."""
+    total, of_run_total = 0.0, 0.0
+    for way in range(len(share)):
+        total += number[way]
+        of_run_total += of_run[way]
+    for way in range(len(share)):
+        share[way] = (number[way] / total + of_run[way]) / (1 + of_run_total)
 
 
 @compiled
@@ -114,7 +136,7 @@ def kernels_along(off: np.ndarray, variance: np.ndarray, chains: Chains) -> tupl
         chains: which follow which.
     """
     order, follows, linked = chains
-    count = len(off)
+    count, size = off.shape
     of_later, of_earlier = np.zeros((count, WAYS)), np.zeros((count, WAYS))
     # The mean of each chain so far, and the number of its closures.
     mean, number = off.copy(), np.ones(count)
@@ -123,15 +145,18 @@ def kernels_along(off: np.ndarray, variance: np.ndarray, chains: Chains) -> tupl
         if before >= 0:
             _fill(of_later[c], off[c], off[before], mean[before], (variance[c], variance[before], number[before]))
             number[c] += linked[c] * number[before]
-            mean[c] += (number[c] - 1) / number[c] * (mean[before] - off[c])
+            for d in range(size):
+                mean[c, d] += (number[c] - 1) / number[c] * (mean[before, d] - off[c, d])
     mean, number = off.copy(), np.ones(count)
-    for c in order[::-1]:
+    for place in range(len(order) - 1, -1, -1):
+        c = order[place]
         before = follows[c]
         if before >= 0:
             _fill(of_earlier[c], off[before], off[c], mean[c], (variance[before], variance[c], number[c]))
             further = linked[c] * number[c]
             number[before] += further
-            mean[before] += further / number[before] * (mean[c] - mean[before])
+            for d in range(size):
+                mean[before, d] += further / number[before] * (mean[c, d] - mean[before, d])
     return of_later, of_earlier
 
 
@@ -158,21 +183,25 @@ def repeated_anywhere(
     total, alike = np.zeros(len(wrong)), np.zeros(len(wrong))
     turned, shifted = np.empty(WIDTHS), np.empty(WIDTHS)
     asks, tells = np.zeros(len(wrong), np.bool_), np.zeros(len(wrong), np.bool_)
-    asks[rows], tells[others] = True, True
-    # Closures on both sides of the comparison are compared with those after them in both directions at once.
-    both_ways = asks & tells & (between[:, 2] < between[:, 3]).any()
+    has_later = False
+    for n in range(len(rows)):
+        asks[rows[n]] = True
+        has_later |= between[n, 2] < between[n, 3]
+    for place in range(len(others)):
+        tells[others[place]] = True
     for n in range(len(rows)):
         row = rows[n]
         for side in range(2):
             for place in range(between[n, 2 * side], between[n, 2 * side + 1]):
                 other = others[place]
                 total[row] += wrong[other]
-                is_both = both_ways[row] and both_ways[other]
+                # Closures on both sides are compared with those after them in both directions at once.
+                is_both = has_later and tells[row] and asks[other]
                 if is_both and side == 1:
                     continue
                 of_turn = errors.turn_variance[row] + errors.turn_variance[other]
                 of_shift = errors.shift_variance[row] + errors.shift_variance[other]
-                for sign in (1, -1):
+                for sign in (1.0, -1.0):
                     square = _apart(errors.shift[row], errors.shift[other], sign)
                     if square > _FARTHEST**2 * _BROADEST * of_shift:
                         continue
@@ -181,15 +210,24 @@ def repeated_anywhere(
                     if square > _FARTHEST**2 * _BROADEST * of_turn:
                         continue
                     _kernels(turned, square, of_turn, turns)
-                    same = turned.mean() * shifted.mean()
+                    same = mean(turned) * mean(shifted)
                     for end in range(2 if is_both else 1):
                         one, another = (row, other) if end == 0 else (other, row)
                         alike[one] += wrong[another] * same / max(same + alone[one], _LEAST)
-                        for of_turns in range(WIDTHS):
-                            told = wrong[another] / 2 * turned[of_turns]
-                            for of_shifts in range(WIDTHS):
-                                density[one, of_turns * WIDTHS + of_shifts] += told * shifted[of_shifts]
+                        for i in range(WIDTHS):
+                            told = wrong[another] / 2 * turned[i]
+                            for j in range(WIDTHS):
+                                density[one, i * WIDTHS + j] += told * shifted[j]
     return density, total, alike
+
+
+@compiled
+def mean(values: np.ndarray) -> float:
+    """The mean of a few values."""
+    total = 0.0
+    for value in values:
+        total += value
+    return total / len(values)
 
 
 @compiled
@@ -207,13 +245,13 @@ def _fill(
     own, other, number = noise
     size = len(off)
     for way in range(2):
-        square = _apart(off, last if way == 0 else mean, 1)
+        square = _apart(off, last if way == 0 else mean, 1.0)
         variance = own + (other if way == 0 else other / number)
         _kernels(kernels[way * WIDTHS : (way + 1) * WIDTHS], square, variance, size)
 
 
 @compiled
-def _apart(off: np.ndarray, other: np.ndarray, sign: int) -> float:
+def _apart(off: np.ndarray, other: np.ndarray, sign: float) -> float:
     """Squared distance of one error from another one (``sign`` 1), or from its opposite (-1)."""
     square = 0.0
     for d in range(len(off)):

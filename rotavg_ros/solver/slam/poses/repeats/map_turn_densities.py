@@ -14,6 +14,7 @@ import numpy as np
 
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.slam.noise.repeats import Near
+from rotavg_ros.solver.slam.poses.repeats.exactness import mean
 
 # The variance of a difference is known only roughly, so there are several: each this many times the one before.
 _BROADER = 16.0
@@ -72,12 +73,12 @@ def repeated_density(
     for t in range(len(tells)):
         most = max(most, 1 + near[t, 1] - near[t, 0] + near[t, 3] - near[t, 2])
     # For each closure that is evidence: which are off by the same turn, and with which probability.
-    number = np.ones(len(tells), np.int64)
+    number = np.empty(len(tells), np.int64)
     alike, how = np.empty((len(tells), most), np.int64), np.empty((len(tells), most))
     difference, root, same = np.empty(size), np.empty((size + 1, size)), np.empty(WIDTHS)
     for t in range(len(tells)):
         row = tells[t]
-        alike[t, 0], how[t, 0] = row, chance[row]
+        alike[t, 0], how[t, 0], number[t] = row, chance[row], 1
         for side in range(2):
             for place in range(near[t, 2 * side], near[t, 2 * side + 1]):
                 other = tells[place]
@@ -85,7 +86,8 @@ def repeated_density(
                 if of_turn < 0:
                     continue
                 _densities(turned, row, difference, (of_turn, of_shift, k), root, same)
-                likely = same.mean() / max(same.mean() + math.exp(log_alone[row]), _LEAST)
+                repeated = mean(same)
+                likely = repeated / max(repeated + math.exp(log_alone[row]), _LEAST)
                 if likely > _NEGLIGIBLE:
                     alike[t, number[t]], how[t, number[t]] = other, likely * chance[other]
                     number[t] += 1
@@ -102,14 +104,16 @@ def repeated_density(
                 of_turn, of_shift = _difference(turned, axes, c, tells[place], difference)
                 if of_turn >= 0:
                     listed[found], slot[tells[place]] = place, found
-                    apart[found] = difference
+                    for d in range(size):
+                        apart[found, d] = difference[d]
                     variance[found, 0], variance[found, 1] = of_turn, of_shift
                     found += 1
         for n in range(found):
             # The mean over all that are turned like this one.
             t = listed[n]
             total, of_turn = 0.0, 0.0
-            difference[:] = 0.0
+            for d in range(size):
+                difference[d] = 0.0
             for entry in range(number[t]):
                 at = slot[alike[t, entry]]
                 if at >= 0:
@@ -123,10 +127,12 @@ def repeated_density(
             square = _densities(turned, c, difference, (of_turn / total**2, 1 / total, k), root, same)
             weight = chance[tells[t]] * math.exp(-square / 2)
             surely[c] += weight
-            density[c] += weight * same
+            for width in range(WIDTHS):
+                density[c, width] += weight * same[width]
         for n in range(found):
             slot[tells[listed[n]]] = -1
-        density[c] /= max(surely[c], 1.0)
+        for width in range(WIDTHS):
+            density[c, width] /= max(surely[c], 1.0)
         surely[c] = min(surely[c], 1.0)
     return surely, density
 

@@ -125,7 +125,7 @@ def _log_sums(
     ways, inner = len(of_run) * len(before), len(of_any) * len(alone) * density.shape[1]
     size = ways * inner
     # Products for the current run; then for all runs, with shared c and d and with their own.
-    product, total, is_small = np.ones(size), np.zeros(size), False
+    product, total = np.ones(size), np.zeros(size)
     products, totals = np.ones(size + inner), np.zeros(size + inner)
     for place in range(len(order)):
         n = order[place]
@@ -144,26 +144,51 @@ def _log_sums(
                             product[at] *= max(each + of_its * density[0, s, n], _LEAST)
                             if not _SMALL < product[at] < _LARGE:
                                 total[at] += math.log(product[at])
-                                product[at], is_small = 1.0, True
+                                product[at] = 1.0
                             at += 1
         if place + 1 < len(order) and run[order[place + 1]] == run[n]:
             continue
-        if is_small:
-            for point in range(inner):
-                log = total[point::inner] + np.log(product[point::inner])
-                largest = log.max()
-                totals[point:size:inner] += log
-                totals[size + point] += largest
-                products[size + point] *= np.exp(log - largest).mean()
-        else:
-            products[:size] *= product
-            products[size:] *= product.reshape(ways, inner).sum(axis=0) / ways
-        product[:], total[:], is_small = 1.0, 0.0, False
+        _count_run(product, total, products, totals)
+        for at in range(size):
+            product[at], total[at] = 1.0, 0.0
         for at in range(size + inner):
             if not _SMALL < products[at] < _LARGE:
                 totals[at] += math.log(products[at])
                 products[at] = 1.0
-    return totals + np.log(products)
+    for at in range(size + inner):
+        totals[at] += math.log(products[at])
+    return totals
+
+
+@compiled
+def _count_run(product: np.ndarray, total: np.ndarray, products: np.ndarray, totals: np.ndarray) -> None:
+    """Multiply the products of all runs by those of one; where c and d are its own, by the mean over these.
+
+    Args:
+        product, total: ``(ways · inner,)`` products of the run, and logarithms taken from them, 0 where none was.
+        products, totals: ``(ways · inner + inner,)`` the same of all runs.
+    """
+    size = len(product)
+    inner = len(products) - size
+    ways, is_small = size // inner, False
+    for at in range(size):
+        is_small |= total[at] != 0.0
+    for point in range(inner):
+        summed = 0.0
+        if is_small:
+            largest = -math.inf
+            for at in range(point, size, inner):
+                total[at] += math.log(product[at])
+                totals[at] += total[at]
+                largest = max(largest, total[at])
+            for at in range(point, size, inner):
+                summed += math.exp(total[at] - largest)
+            totals[size + point] += largest
+        else:
+            for at in range(point, size, inner):
+                products[at] *= product[at]
+                summed += product[at]
+        products[size + point] *= summed / ways
 
 
 def false_density(
