@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from functools import update_wrapper
+from types import FunctionType
 from typing import Any, Generic, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., object])
@@ -26,6 +27,7 @@ class _Compiled(Generic[Function]):
     def __init__(self, function: Function) -> None:
         self._function = function
         self._dispatcher: Function | None = None
+        self._inner: Function | None = None
         update_wrapper(self, function)
 
     def __call__(self, *arguments: Any) -> object:
@@ -35,20 +37,31 @@ class _Compiled(Generic[Function]):
     def dispatcher(self) -> Function:
         """Numba's dispatcher of the function."""
         if self._dispatcher is None:
-            import numba
-
-            function = self._function
-            # The functions that it calls must be dispatchers as well.
-            for name in function.__code__.co_names:
-                called = function.__globals__.get(name)
-                if isinstance(called, _Compiled):
-                    function.__globals__[name] = called.dispatcher
-            njit: Any = numba.njit  # its types lack the last option: no C code calls a kernel
-            made = njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function)
+            made = self._made()
             with suppress(RuntimeError):  # neither folder can be written to: it is compiled in every process
-                made._cache = _kept(function)
+                made._cache = _kept(made.py_func)
             self._dispatcher = cast(Function, made)
         return self._dispatcher
+
+    @property
+    def inner(self) -> Function:
+        """The same for other kernels: Python cannot call it, and it is not cached, since their code contains it."""
+        if self._inner is None:
+            self._inner = cast(Function, self._made(no_cpython_wrapper=True))
+        return self._inner
+
+    def _made(self, **options: bool) -> Any:
+        import numba
+
+        function: Any = self._function
+        # The functions that it calls must be dispatchers as well.
+        names = dict(function.__globals__)
+        for name in function.__code__.co_names:
+            if isinstance(names.get(name), _Compiled):
+                names[name] = names[name].inner
+        own = FunctionType(function.__code__, names, function.__name__, function.__defaults__, function.__closure__)
+        njit: Any = numba.njit  # its types lack options that leave out what only others call
+        return njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, **options)(update_wrapper(own, function))
 
 
 def _kept(function: Callable[..., object]) -> object:

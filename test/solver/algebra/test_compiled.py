@@ -80,7 +80,7 @@ def test_what_a_power_cut_left_of_machine_code_is_made_again(suffix: str, left: 
 
     assert answers() == ["6", "0"]
     kept = list((tmp_path / "cache").rglob(f"*.{suffix}"))
-    assert len(kept) == 2
+    assert len(kept) == 1  # the outer one's code contains the inner one
     for each in kept:
         each.write_bytes(left)
     assert answers() == ["6", "0"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rotavg_ros.solver.algebra.small_matrices import eigh, inverse, inverse_root
+from rotavg_ros.solver.algebra.small_matrices import _eigh, eigh, inverse, inverse_root
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 6])
@@ -55,3 +55,12 @@ def test_eigenvectors_are_numpys(size: int) -> None:
     )
     made = vector @ (value[:, :, None] * vector.transpose(0, 2, 1))
     np.testing.assert_allclose(made / largest[:, None, None], before / largest[:, None, None], atol=1e-13)
+
+
+def test_parts_of_matrices_need_no_code_of_their_own() -> None:
+    """One compilation is for all layouts in memory."""
+    matrices = np.random.default_rng(4).standard_normal((5, 6, 6))
+    matrices += matrices.transpose(0, 2, 1)
+    for part, same in zip(eigh(matrices[:, 3:, 3:]), eigh(matrices[:, 3:, 3:].copy()), strict=True):
+        np.testing.assert_array_equal(part, same)
+    assert len(_eigh.dispatcher.signatures) == 1  # type: ignore[attr-defined]

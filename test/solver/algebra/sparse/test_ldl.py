@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from rotavg_ros.solver.algebra.sparse import ldl
 from rotavg_ros.solver.algebra.sparse.ldl import RowPattern
+from rotavg_ros.solver.algebra.sparse.ldl_loops import _merge_in
 from rotavg_ros.solver.running.work import metered
 
 
@@ -104,3 +105,11 @@ def test_what_rounding_leaves_no_pivot_stays_positive(many: int, monkeypatch: py
     factor = RowPattern(column, value, 50).factorise(np.full(49, 1e16), np.append(1e-3, np.zeros(49)))
     assert (factor.diagonal > 0).all()
     assert np.isfinite(factor.solve(np.ones((50, 1)))).all()
+
+
+@pytest.mark.parametrize(("known", "new"), [(0, 0), (0, 3), (3, 0), (1, 7), (20, 30)])
+def test_paths_are_merged_in_order(known: int, new: int) -> None:
+    numbers = np.random.default_rng(known).permutation(100)[: known + new]
+    way, path = np.append(np.sort(numbers[:known]), np.zeros(new, dtype=np.int64)), np.sort(numbers[known:])
+    _merge_in(path, way)
+    np.testing.assert_array_equal(way, np.sort(numbers))
