@@ -32,7 +32,7 @@ SWITCHES: dict[str, str] = {
     "robust-start": "no start gives odometry robust weights, as it does closures",
     "minimum-cuts": "no start turns whole parts of the map",
     "tilt": "odometry errs equally about all axes, even where gravity holds roll and pitch",
-    "body-axes": "closures, and odometry that gravity does not hold, err equally about all axes of the body",
+    "body-axes": "where no vertical is known, turns err equally about all axes of the body",
     "translations": "closures are judged by their rotations alone",
     "jumps": "odometry's position does not jump while its heading stays right",
     "believed-runs": "closures of a run that make each other seem to join wrong places are believed only one at a time",

@@ -37,18 +37,13 @@ class EvenTurns:
         return cls(unit, unit)
 
     @classmethod
-    def of(cls, mode: Mode, *, odometry: bool) -> EvenTurns:
-        """Estimated for closures, and for odometry unless gravity tells its axes.
-
-        Args:
-            mode: a labelling of rotations in space, with its residuals.
-            odometry: whether odometry's axes may differ, too.
-        """
+    def of(cls, mode: Mode) -> EvenTurns:
+        """Estimated for odometry and for closures, from a labelling of rotations in space."""
         graph = mode.problem.graph
         bodies = mode.problem.body_from_world(mode.state.correction)
         ends = bodies[graph.source], bodies[graph.target]
         covariance = np.tile(np.eye(3), (len(graph.source), 1, 1))
-        for kind in (graph.is_closure, graph.is_odometry & odometry):
+        for kind in (graph.is_closure, graph.is_odometry):
             rows = np.flatnonzero(kind)
             own = _in_body(mode, rows[mode.state.is_good[rows]], ends)
             # The frame of either end, so that an edge's direction does not matter.

@@ -121,10 +121,14 @@ class PoseProblem:
 
     @cached_property
     def even_turns(self) -> EvenTurns:
-        """Units in which the rows' turns err alike about all axes."""
-        if self.turns < 3 or "body-axes" in self.mode.problem.without:
+        """Units in which the rows' turns err alike about all axes.
+
+        Where gravity holds some axes these are known, and closures' residuals by rotations alone would seem to err
+        about the vertical, as odometry does.
+        """
+        if self.turns < 3 or self.drift_axis is not None or "body-axes" in self.mode.problem.without:
             return EvenTurns.alike(len(self.drawn.source), self.turns)
-        return EvenTurns.of(self.mode, odometry=self.drift_axis is None)
+        return EvenTurns.of(self.mode)
 
     @property
     def num_about(self) -> int:

@@ -9,10 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver import solve
-from rotavg_ros.solver.slam.poses.even_turns import EvenTurns
 from rotavg_ros.view_graph import ViewGraph
 
-from .test_poses import HILLS, graph_of, pose_mode, simulated
+from .test_poses import HILLS, graph_of, held_by_gravity, pose_mode, simulated
 
 STEP, SHIFT = np.radians(1.0), 0.2
 # Deviations about the body's axes, in units of their geometric mean.
@@ -110,8 +109,11 @@ def test_the_mean_square_of_a_turn_follows_from_that_of_even_turns() -> None:
 def test_all_axes_are_alike_in_the_plane_and_if_told_so() -> None:
     plane = pose_mode(graph_of(simulated(1, dimensions=2)))
     assert (plane.problem.even_turns.even == 1).all()
-    hills = graph_of(simulated(1, **HILLS))
-    assert (pose_mode(hills, without={"body-axes"}).problem.even_turns.even == np.eye(3)).all()
-    pose = pose_mode(hills)
-    kept = EvenTurns.of(pose.problem.mode, odometry=False)
-    assert (kept.even[: pose.problem.drawn.num_segments] == np.eye(3)).all()
+    without = pose_mode(sphere(0, UNEVEN)[0], without={"body-axes"})
+    assert (without.problem.even_turns.even == np.eye(3)).all()
+
+
+@torch.no_grad()
+def test_where_gravity_holds_axes_its_ratio_is_what_they_err_by() -> None:
+    held = pose_mode(held_by_gravity(simulated(1, **HILLS), 0.6))
+    assert (held.problem.even_turns.even == np.eye(3)).all()
