@@ -138,7 +138,15 @@ class PoseProblem:
     def mean_turn(self, noise: PoseNoise) -> float:
         """rad², variance of one step of odometry, averaged over components."""
         of_even = float(self.mean_over_axes(np.array([noise.turn, noise.tilt])))
-        return of_even * float(self.even_turns.mean_square[: self.drawn.num_segments].mean())
+        return of_even * self._mean_square(np.arange(self.drawn.num_segments))
+
+    def mean_closure_turn(self, noise: PoseNoise) -> float:
+        """rad², variance of a typical good closure, averaged over components."""
+        return noise.closure_turn * self._mean_square(self.mode.problem.closure)
+
+    def _mean_square(self, rows: np.ndarray) -> float:
+        """Mean over some edges of the variance of a turn whose even turn has the variance 1."""
+        return float(self.even_turns.mean_square[rows].mean()) if len(rows) else 1.0
 
     def mean_over_axes(self, variance: np.ndarray) -> np.ndarray:
         """Variances about the drift axis and any other one, ``(…, 2)`` → their mean over components, ``(…)``."""

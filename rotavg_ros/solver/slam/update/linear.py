@@ -113,7 +113,8 @@ class Linear:
         problem, solved, drawn = pose.problem, pose.solved, pose.problem.drawn
         # A single mean variance for all axes.
         turn = problem.mean_turn(pose.state.noise)
-        noise = replace(pose.state.noise, turn=turn, tilt=turn)
+        closure = problem.mean_closure_turn(pose.state.noise)
+        noise = replace(pose.state.noise, turn=turn, tilt=turn, closure_turn=closure)
         turns, shifts = problem.bases
         segment = problem.segment_of_node
         length = np.where(segment >= 0, solved.way.length[np.maximum(segment, 0)], 0.0)

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver import solve
+from rotavg_ros.solver.slam.update.linear import Linear
 from rotavg_ros.view_graph import ViewGraph
 
 from .test_poses import HILLS, graph_of, held_by_gravity, pose_mode, simulated
@@ -103,6 +104,15 @@ def test_the_mean_square_of_a_turn_follows_from_that_of_even_turns() -> None:
     drawn = np.random.default_rng(0).normal(size=(len(even.even), 3, 400))
     np.testing.assert_allclose((even.uneven @ drawn).var(axis=(1, 2)), even.mean_square, rtol=0.3)
     assert (even.mean_square > 1.3).all()
+
+
+@torch.no_grad()
+def test_between_ticks_variances_are_the_mean_over_axes() -> None:
+    pose = pose_mode(sphere(0, UNEVEN)[0])
+    even, noise, between = pose.problem.even_turns, pose.state.noise, Linear.of_poses(pose).noise
+    closure = pose.problem.mode.problem.closure
+    assert between.closure_turn == pytest.approx(noise.closure_turn * even.mean_square[closure].mean(), rel=1e-12)
+    assert between.turn == pytest.approx(noise.turn * even.mean_square[: closure.min()].mean(), rel=1e-12)
 
 
 @torch.no_grad()
