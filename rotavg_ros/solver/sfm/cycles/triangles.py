@@ -55,6 +55,7 @@ class Triangles:
         count = (first[1:] - first[:-1])[target]
         up_to = count.cumsum(0)
         paths = int(up_to[-1]) if graph.num_edges else 0
+        run = min(run, max(paths, 1))  # a run may be longer than all of them, its indices need not be
         of_each = torch.as_tensor(most).reshape(-1)
         if len(of_each) == 1 or component is None:
             stride = run * max(1, -(-paths // int(of_each[0])))
