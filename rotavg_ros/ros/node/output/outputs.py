@@ -76,15 +76,18 @@ class Outputs:
     def draw(self, answer: Answer | None) -> None:
         """Publish paths and markers of the last answer if anybody subscribes, and again for new subscribers.
 
-        From now on poses follow the answer, too. If there is no answer, since all was forgotten, drawings are erased.
+        From now on poses follow the answer, too. If there is no answer, since all was forgotten, drawings are erased
+        and poses are odometry's own.
 
         Called at least once a second, so that drawings skipped to save time are made later.
         """
         if answer is None:
             self._erase()
+            self._poses.are_placed = True
             return
         if self._poses.are_wanted:
             self._trajectories(answer)
+        self._poses.are_placed = self._placed[0] == answer.version
         started = time.monotonic()
         if started < self._rests_until:
             return

@@ -33,6 +33,10 @@ _DIAGONAL = slice(None, None, 7)
 class RobotPoses:
     """Publishes a pose for every odometry message with a position, corrected by the last placed answer.
 
+    Attributes:
+        are_placed: whether the last answer that was drawn has been placed. Nobody places one while nobody wants poses;
+            who comes then gets none until it is, since the last one placed may be hours old.
+
     Raises:
         UserError: a topic's ``qos_overrides`` are invalid, or ``publish_tf`` without tf2_msgs.
     """
@@ -42,6 +46,7 @@ class RobotPoses:
     ) -> None:
         """Advertise the topics; ``prefix`` holds the prefix of each robot's topics."""
         self._estimator = estimator
+        self.are_placed = True  # until there is an answer, poses are odometry's own
         self._frame_id = parameters.world_frame
         self._publishers = {
             robot: publisher(node, Odometry, f"{prefix[robot]}corrected_odometry", QoSProfile(depth=10))
@@ -84,7 +89,7 @@ class RobotPoses:
         position = record.known_position
         placed = self._estimator.odometry_frame(robot) if position is not None else None
         is_asked_for = self._publishers[robot].get_subscription_count() > 0
-        if placed is None or position is None or not (is_asked_for or self._tf is not None):
+        if placed is None or position is None or not self.are_placed or not (is_asked_for or self._tf is not None):
             return
         exact, steps = placed
         frame = self._gradual_frame(robot).follow(exact, record.stamp_ns, position)
