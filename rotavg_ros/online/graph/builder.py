@@ -68,6 +68,8 @@ class GraphBuilder:
         track = self.tracks.get(robot)
         if track is None:
             track = OdometryTrack(self.options.odometry_bounds, self.options.continuity_limits)
+        elif track.comes_after_the_clock(message.stamp_ns, self.options.time_jump_ns):
+            self.begin_time_line(robot)
         try:
             track.add(message.stamp_ns, message.world_from_body, message.position)
         except RejectedInputError as rejection:
@@ -109,6 +111,9 @@ class GraphBuilder:
     def clock_went_back(self, now_ns: int) -> bool:
         """The clock that stamps the data went back: a new time line for every robot whose odometry is ahead of it.
 
+        It begins with the first message that is back as well: the clock comes on a topic of its own, and may overtake
+        odometry, of which all that is not back belongs to the time line before.
+
         Returns:
             whether there was one.
         """
@@ -117,10 +122,10 @@ class GraphBuilder:
             for robot, track in self.tracks.items()
             if track.latest is not None
             and track.latest.stamp_ns - now_ns > self.options.time_jump_ns
-            and not track.begins_time_line
+            and not (track.begins_time_line or track.awaits_time_line)
         ]
         for robot in ahead:
-            self.begin_time_line(robot)
+            self.tracks[robot].await_time_line()
         return bool(ahead)
 
     def add_edge(self, edge: EdgeMeasurement) -> RejectReason | None:

@@ -104,7 +104,8 @@ class Growth:
     def is_undecided(self, robot: str) -> bool:
         """Whether it is unclear to which time line of a robot a stamp that comes now belongs."""
         track = self.tracks.get(robot)
-        return self.backward_jumps.is_undecided(robot) or (track is not None and track.begins_time_line)
+        begins = track is not None and (track.begins_time_line or track.awaits_time_line)
+        return begins or self.backward_jumps.is_undecided(robot)
 
     def advance_data_time(self, stamp_ns: int) -> None:
         """Advance the data's time and give up edges that have waited too long."""

@@ -49,6 +49,7 @@ class OdometryTrack:
         self._continuity = ContinuityCheck(limits)
         self._before_latest: OdometrySample | None = None
         self._begins_time_line = False
+        self._clock_went_back_at: int | None = None
         self._is_restored = False
         self._without_position_since: int | None = None
 
@@ -56,9 +57,28 @@ class OdometryTrack:
         """Change what applies from now on."""
         self.samples.bounds, self._continuity.limits = bounds, limits
 
+    def await_time_line(self) -> None:
+        """The clock that stamps the odometry went back. Messages from before may still be on their way."""
+        assert self.latest is not None
+        self._clock_went_back_at = self.latest.stamp_ns
+
+    @property
+    def awaits_time_line(self) -> bool:
+        """Whether the clock went back, and no message from after it has come yet.
+
+        Odometry that goes on for ``lead_ns`` as if nothing had happened is stamped by another clock.
+        """
+        at, latest, lead_ns = self._clock_went_back_at, self.latest, self._continuity.limits.lead_ns
+        return at is not None and latest is not None and latest.stamp_ns - at <= lead_ns
+
+    def comes_after_the_clock(self, stamp_ns: int, time_jump_ns: int) -> bool:
+        """Whether a message with this stamp is the first from after the clock went back."""
+        is_back = self.latest is not None and self.latest.stamp_ns - stamp_ns > time_jump_ns
+        return self.awaits_time_line and is_back
+
     def begin_time_line(self) -> None:
         """The robot's clock went back: the next message begins a new time line, whatever its stamp."""
-        self._begins_time_line = True
+        self._begins_time_line, self._clock_went_back_at = True, None
 
     @property
     def begins_time_line(self) -> bool:
@@ -160,7 +180,7 @@ class OdometryTrack:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Everything as arrays, for :meth:`from_arrays`."""
-        anchors = np.array(self.anchors, dtype=np.float64).reshape(-1, 4)
+        anchors, at = np.array(self.anchors, dtype=np.float64).reshape(-1, 4), self._clock_went_back_at
         return (
             self.samples.arrays()
             | self._continuity.arrays()
@@ -168,6 +188,7 @@ class OdometryTrack:
                 "num_keyframes": np.array(self.num_keyframes),
                 "anchors": anchors,
                 "begins_time_line": np.array(self._begins_time_line),
+                "clock_went_back_at": np.array([] if at is None else [at], dtype=np.int64),
             }
         )
 
@@ -182,6 +203,8 @@ class OdometryTrack:
         track.num_keyframes = int(arrays["num_keyframes"])
         track.anchors = [(x, y, z, w) for x, y, z, w in arrays["anchors"].tolist()]
         track._begins_time_line = bool(arrays["begins_time_line"])
+        # Files of earlier versions do not have it.
+        track._clock_went_back_at = next(iter(arrays.get("clock_went_back_at", np.empty(0)).tolist()), None)
         track._before_latest, track.latest, track.last_keyframe = samples.latest_of_chain()
         track.chain, track.time_line = samples.last_chain, samples.last_time_line
         track._is_restored = track.latest is not None

@@ -217,6 +217,36 @@ def test_the_clock_begins_a_time_line_for_the_robots_that_are_ahead_of_it(kept) 
     assert kept.counts().rejected == {}
 
 
+@pytest.mark.parametrize("restart", [False, True])
+def test_odometry_that_the_clock_overtakes_belongs_to_the_time_before(restart: bool, tmp_path: Path) -> None:
+    online = estimator("new_component")
+    feed(online, range(40))
+    online.clock_went_back(0)
+    assert online.add_edge(closure(1, 2 * SECOND, 5 * SECOND)) is None
+    if restart:
+        online.save(tmp_path / "state.npz")
+        online = estimator("new_component")
+        online.load(tmp_path / "state.npz")
+    assert feed(online, range(40, LENGTH)) == [None] * (LENGTH - 40)  # they were under way
+    assert online.counts().pending == 1, "which of the two times its stamps mean is not known yet"
+    feed(online, range(LENGTH))
+    snapshot = online.snapshot()
+    assert snapshot.time_line.tolist() == [0] * LENGTH + [1] * LENGTH
+    assert int(snapshot.graph.is_odometry.sum()) == 2 * (LENGTH - 1)
+    assert online.counts().pending == 0 and ends(online) == [(LENGTH + 20, LENGTH + 50)]
+    assert online.time_jumps == (0 if restart else 1) and online.counts().rejected == {}
+
+
+def test_odometry_that_does_not_follow_the_clock_goes_on() -> None:
+    online = estimator("new_component")
+    feed(online, range(40))
+    online.clock_went_back(0)
+    assert online.add_edge(closure(1, 2 * SECOND, 3 * SECOND)) is None and online.counts().pending == 1
+    feed(online, range(40, 700))  # a minute and six seconds: its stamps are another clock's
+    assert online.counts().pending == 0 and ends(online) == [(20, 30)]
+    assert not online.snapshot().time_line.any()
+
+
 @given(late=st.lists(st.tuples(st.integers(0, LENGTH - 1), st.integers(0, 10_000)), max_size=40))
 def test_stray_old_messages_among_good_ones_change_nothing(late: list[tuple[int, int]]) -> None:
     """Up to four in a row whatever their stamps; a good message in between starts the count anew."""
