@@ -9,7 +9,7 @@ from typing import Any
 from rotavg_ros.inputs.fields import target_from_source, to_nanoseconds, to_tuple
 from rotavg_ros.inputs.records import EdgeRecord, Source
 from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason, quaternion
-from rotavg_ros.online.measurements import RejectedInputError
+from rotavg_ros.online.measurements import RejectedInputError, check_length
 from rotavg_ros.online.quaternion import Vector
 
 _AXES = 3
@@ -65,9 +65,14 @@ def edge_from_message(message: Any, source: Source) -> EdgeMeasurement:
 
 
 def _translation(message: Any, source: Source) -> Vector | None:
-    """Translation between bodies, as far as the sensor's orientation determines it; None if the message has none."""
-    if len(message.translation) != _AXES:
+    """Translation between bodies, as far as the sensor's orientation determines it; None if the message has none.
+
+    Raises:
+        RejectedInputError: one or two numbers, as of a sender that means the plane.
+    """
+    if not len(message.translation):
         return None
+    check_length(message.translation, _AXES)
     x, y, z = (float(part) for part in message.translation)
     return quaternion.rotate(source.body_from_sensor, (x, y, z))
 

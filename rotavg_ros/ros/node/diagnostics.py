@@ -110,9 +110,13 @@ def _warnings(health: Health, parameters: NodeParameters, now: float) -> list[st
         last = health.last_odometry.get(topic)
         silent = now - (health.started if last is None else last)
         if silent > parameters.odometry_timeout_s and (needed or last is not None):
-            warnings.append(
-                f"no odometry yet on {topic}" if last is None else f"no odometry for {silent:.0f} s on {topic}"
-            )
+            refused, reason = health.last_refusal.get(topic, (-math.inf, ""))
+            if now - refused <= parameters.odometry_timeout_s:  # it comes, so nobody need look for the driver
+                warnings.append(f"all odometry on {topic} has been refused for {silent:.0f} s ({reason})")
+            else:
+                warnings.append(
+                    f"no odometry yet on {topic}" if last is None else f"no odometry for {silent:.0f} s on {topic}"
+                )
     median = health.ticks.median_ms(_RECENT_S)
     if median > 1e3 * parameters.solve_period_s:
         warnings.append(f"a solve takes longer ({median:.0f} ms) than solve_period_s")

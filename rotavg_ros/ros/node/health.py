@@ -23,6 +23,7 @@ class Health:
         odometry_latency: time from the sending of odometry to the publishing of ``orientation``.
         started: when the node started.
         last_odometry: when a message was last taken, by topic name.
+        last_refusal: when odometry was last refused, and why, by topic name.
         mistakes: present mistakes in the wiring and the parameters, a line each.
         answer: the last answer published; None before the first, or once it is forgotten.
         answered: when an answer was last published; None before the first.
@@ -44,6 +45,7 @@ class Health:
     odometry_latency: Durations = field(default_factory=Durations)
     started: float = field(default_factory=time.monotonic)
     last_odometry: dict[str, float] = field(default_factory=dict)
+    last_refusal: dict[str, tuple[float, str]] = field(default_factory=dict)
     mistakes: list[str] = field(default_factory=list)
     answer: Answer | None = None
     joins: int = 0
@@ -76,6 +78,10 @@ class Health:
     def took_odometry(self, topic: str) -> None:
         """An odometry message was taken."""
         self.last_odometry[topic] = time.monotonic()
+
+    def refused_odometry(self, topic: str, reason: str) -> None:
+        """An odometry message was refused."""
+        self.last_refusal[topic] = time.monotonic(), reason
 
     def fell_behind(self) -> None:
         """The graph has changed since the answer; the first such call sets :attr:`unsolved_since`."""

@@ -69,6 +69,18 @@ def test_fields() -> None:
     assert (edge.target.robot, edge.target.keyframe_id, edge.target.stamp_ns) == ("default", None, 9 * 10**9 + 1)
 
 
+def test_a_translation_in_the_plane_is_refused_and_not_left_out() -> None:
+    """It would silently count as unknown, and places would not be judged."""
+    told = message(Rotation.identity())
+    for translation, known in (([], None), ([1.0, 2.0, 3.0], (1.0, 2.0, 3.0))):
+        told.translation = translation
+        assert edge_from_message(told, Source("default")).translation == known
+    for translation in ([1.0], [1.0, 2.0]):
+        told.translation = translation
+        with pytest.raises(RejectedInputError, match="wrong_length"):
+            edge_from_message(told, Source("default"))
+
+
 def test_stamps() -> None:
     assert to_nanoseconds(Time(sec=2, nanosec=3)) == 2_000_000_003
     assert to_time(2_000_000_003) == Time(sec=2, nanosec=3)

@@ -90,6 +90,19 @@ def test_silence_is_told_of_each_topic(health: Health) -> None:
     assert report(health).message == "no odometry for 100 s on /odom"
 
 
+def test_odometry_that_is_refused_is_not_called_silent(health: Health) -> None:
+    health.started = time.monotonic() - 100
+    health.last_odometry.clear()
+    health.refused_odometry("/odom", "repeated_stamp")
+    assert report(health).message == "all odometry on /odom has been refused for 100 s (repeated_stamp)"
+    health.last_odometry["/odom"] = time.monotonic() - 10
+    assert report(health).message == "all odometry on /odom has been refused for 10 s (repeated_stamp)"
+    health.last_odometry["/odom"] = time.monotonic()
+    assert report(health).message == "ok"
+    health.last_odometry["/odom"], health.last_refusal["/odom"] = health.started, (health.started + 1, "future_stamp")
+    assert report(health).message == "no odometry for 100 s on /odom"
+
+
 def test_edges_that_wait_for_what_hardly_comes(health: Health) -> None:
     def of(**counts: object) -> str:
         reporter = Reporter("rotavg: estimator")

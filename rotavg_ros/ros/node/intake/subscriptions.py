@@ -160,6 +160,7 @@ class Subscriptions:
             self._health.took_odometry(topic.name)
             self._outputs.publish_odometry(topic.robot, topic.name, message, record)
         else:
+            self._health.refused_odometry(topic.name, reason.value)
             self._warn_of_refusal(f"odometry of {topic.robot}", reason)
         if self._estimator.time_jumps != time_jumps:
             self._on_time_jump()
