@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,6 +151,9 @@ class Content:
             self.state.world_from_odometry.pop(robot, None)
             if before is not None and (frame := next_frame(before, track, self.correction(robot))) is not None:
                 self._frames[robot] = frame
+        elif taken[0] is None and (placed := self._frames.get(robot)) is not None:
+            if placed.steps is not None and track is not None and track.latest is not None:
+                placed.steps.go_on(track.latest)
         elif track is not None and robot not in self._frames and self.answered is None:
             frame = first_frame(track, self.correction(robot))
             self._frames |= {} if frame is None else {robot: frame}
@@ -164,11 +167,18 @@ class Content:
         frame = self._frames.get(robot)
         if frame is None:
             return None
-        return frame, self.builder.tracks[robot].num_keyframes - frame.keyframes_before + 1
+        counted = self.builder.tracks[robot].num_keyframes - frame.keyframes_before
+        return frame, (counted if frame.steps is None else frame.steps.count) + 1
 
     def take_frames(self, frames: Mapping[str, OdometryFrame]) -> None:
         """Take the odometry frames of robots that an answer has placed."""
-        self._frames |= frames
+        for robot, frame in frames.items():
+            before = self._frames.get(robot)
+            counted = None if before is None or before.chain != frame.chain else before.steps
+            if counted is not None and frame.steps is not None and counted.moment == frame.steps.moment:
+                # A later answer with the same newest keyframe does not make the way since then any shorter.
+                frame = replace(frame, steps=counted)
+            self._frames[robot] = frame
 
     def correction(self, robot: str) -> Quaternion:
         """world_from_odometry; before the robot's first answer, the one that makes its first odometry fit the gauge."""

@@ -7,12 +7,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.answer.answer import Answer
 from rotavg_ros.online.answer.trajectory import Trajectory
 from rotavg_ros.online.graph.builder import GraphBuilder
 from rotavg_ros.online.measurements import RejectedInputError
+from rotavg_ros.online.odometry.continuity import OdometrySample
+from rotavg_ros.online.odometry.steps import OdometrySteps, StepSize
 from rotavg_ros.online.odometry.track import OdometryTrack
 from rotavg_ros.online.quaternion import Quaternion, Vector
 from rotavg_ros.view_graph import EdgeKind
@@ -60,6 +63,7 @@ class OdometryFrame:
         origin: position of the odometry frame's origin in the world, metres.
         keyframe_position: position of that keyframe in the odometry frame, metres.
         keyframes_before: number of keyframes that the robot's odometry had made up to that one.
+        steps: of odometry since that keyframe; None where odometry chooses the keyframes, and so counts them.
         drift: variances of poses derived from the frame.
         is_planar: whether the robot has turned about the world's z axis only.
     """
@@ -69,6 +73,7 @@ class OdometryFrame:
     origin: Vector
     keyframe_position: Vector
     keyframes_before: int = 0
+    steps: OdometrySteps | None = None
     drift: Drift = UNKNOWN_DRIFT
     is_planar: bool = False
 
@@ -117,7 +122,8 @@ def placed_frames(
         builder: its graph may have grown since.
     """
     is_planar = bool((np.abs(answer.target_from_source[:, :2]) < _PLANAR).all())
-    steps = _step_variances(answer)
+    step_variances = _step_variances(answer)
+    chosen_by_front_end = builder.options.keyframe_source == "edges"
     found = {}
     for robot, trajectory in trajectories.items():
         track = builder.tracks.get(robot)
@@ -138,14 +144,32 @@ def placed_frames(
         frame = OdometryFrame.through(track.chain, world_from_odometry, position, odometry_position)
         node = int(trajectory.node[newest])
         deviation = float(answer.uncertainty[node])
+        steps = None
+        if chosen_by_front_end:
+            keyframe = OdometrySample(moment[0], odometry, odometry_position)
+            steps = OdometrySteps(_step_size(answer, robot), moment[1], keyframe, track.latest)
         place = math.nan if answer.position_uncertainty is None else float(answer.position_uncertainty[node])
         found[robot] = replace(
             frame,
             keyframes_before=track.num_keyframes - _keyframes_since(builder, robot, moment),
-            drift=Drift(deviation**2, place**2, *steps),
+            steps=steps,
+            drift=Drift(deviation**2, place**2, *step_variances),
             is_planar=is_planar,
         )
     return found
+
+
+def _step_size(answer: Answer, robot: str) -> StepSize:
+    """The step between a robot's keyframes, by those odometry edges that stand for one step."""
+    of_robot = answer.keyframe_robot[answer.source] == answer.robots.index(robot)
+    steps = of_robot & (answer.kind == EdgeKind.ODOMETRY) & (answer.steps == 1)
+    angle = 2 * np.arccos(np.abs(answer.target_from_source[steps, 3]).clip(max=1.0))
+    distance = np.linalg.norm(answer.translation[steps], axis=1)
+    return StepSize(*(_root_mean_square(values[np.isfinite(values)]) for values in (angle, distance)))
+
+
+def _root_mean_square(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt((values**2).mean())) if len(values) else 0.0
 
 
 def _keyframes_since(builder: GraphBuilder, robot: str, moment: tuple[int, int]) -> int:

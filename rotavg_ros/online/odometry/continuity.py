@@ -139,13 +139,13 @@ def has_jumped(
         limits: with an infinite turn rate, odometry that begins anew is not detected either.
     """
     seconds = max(1e-9 * (sample.stamp_ns - last.stamp_ns), _SHORTEST_S)
-    angle, metres = _angle_and_metres(last, sample)
+    angle, metres = angle_and_metres(last, sample)
     if angle > limits.turn_rate * seconds or metres > limits.speed * seconds:
         return True
     if math.isinf(limits.turn_rate) or before is None or last.stamp_ns <= before.stamp_ns or not _is_zero(sample):
         return False
     for share in _SHARES_OF_SPEED:
-        angle, metres = _angle_and_metres(_going_on(last, before, sample.stamp_ns, share), sample)
+        angle, metres = angle_and_metres(_going_on(last, before, sample.stamp_ns, share), sample)
         if angle <= _RETURN_ANGLE and metres <= _RETURN_DISTANCE_M:
             return False
     return True
@@ -164,7 +164,7 @@ def goes_on(sample: OdometrySample, last: OdometrySample, limits: ContinuityLimi
 
 def stands_still(sample: OdometrySample, last: OdometrySample) -> bool:
     """Whether a message repeats the last pose, and that pose is not one at which odometry begins."""
-    angle, metres = _angle_and_metres(last, sample)
+    angle, metres = angle_and_metres(last, sample)
     return angle < _ZERO_ANGLE and metres < _ZERO_DISTANCE_M and _distance(_beginning(sample), sample) > 1
 
 
@@ -172,7 +172,8 @@ def _beginning(sample: OdometrySample) -> OdometrySample:
     return OdometrySample(sample.stamp_ns, quaternion.IDENTITY, (0.0, 0.0, 0.0))
 
 
-def _angle_and_metres(first: OdometrySample, second: OdometrySample) -> tuple[float, float]:
+def angle_and_metres(first: OdometrySample, second: OdometrySample) -> tuple[float, float]:
+    """Angle and distance between two poses, radians and metres; the distance is 0 where a position is unknown."""
     metres = 0.0
     if first.position is not None and second.position is not None:
         metres = math.dist(first.position, second.position)
@@ -181,7 +182,7 @@ def _angle_and_metres(first: OdometrySample, second: OdometrySample) -> tuple[fl
 
 def _distance(first: OdometrySample, second: OdometrySample) -> float:
     """How far apart two poses are, in units of :data:`_RETURN_ANGLE` and :data:`_RETURN_DISTANCE_M`."""
-    angle, metres = _angle_and_metres(first, second)
+    angle, metres = angle_and_metres(first, second)
     return angle / _RETURN_ANGLE + metres / _RETURN_DISTANCE_M
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -198,3 +198,43 @@ def test_nobody_is_placed_by_what_was_forgotten_nor_after_a_load_until_there_is_
     again = frame_of(estimator)
     np.testing.assert_allclose(again.origin, placed.origin, atol=1e-6)
     np.testing.assert_allclose(again.orientation, placed.orientation, atol=1e-8)
+
+
+def test_variances_grow_while_a_front_end_is_silent_but_not_while_the_robot_stands():
+    """Keyframes come from a front end: odometry's steps since the last of them count all the same."""
+    every, options = 5, replace(OPTIONS, keyframe_source="edges")
+    run, estimator = drive(), OnlineEstimator(options)
+
+    def keyframe(number: int) -> None:
+        ends = (number - every, number)
+        source, target = (KeyframeReference("r", end, run.stamps[end]) for end in ends)
+        turn = (run.odometry[ends[0]].inv() * run.odometry[number]).as_quat().tolist()
+        way = run.odometry[ends[0]].inv().apply(run.odometry_position[number] - run.odometry_position[ends[0]])
+        edge = EdgeMeasurement.from_ros(number, source, target, turn, way.tolist())
+        assert estimator.add_edge(replace(edge, kind=0)) is None
+
+    def deviation() -> float:
+        frame, steps = estimator.odometry_frame("r")
+        return math.sqrt(frame.drift.after(steps, 0.0)[0])
+
+    for number in range(0, LAP + 1, every):
+        run.feed(estimator, number, number + every)
+        if number:
+            keyframe(number)
+    estimator.place(answered(estimator))
+    frame, steps = estimator.odometry_frame("r")
+    assert steps == 1
+    begun = deviation()
+    run.feed(estimator, LAP + every, 2 * LAP)
+    _, steps = estimator.odometry_frame("r")
+    assert steps == pytest.approx(LAP / every, abs=2)
+    expected = math.sqrt(begun**2 + (steps - 1) * frame.drift.step_orientation)
+    assert deviation() == pytest.approx(expected) and expected > 1.1 * begun
+    last, stands = 2 * LAP - 1, steps
+    for tenths in range(1, 100):
+        pose = run.odometry[last].as_quat().tolist(), run.odometry_position[last].tolist()
+        assert estimator.add_odometry("r", run.stamps[last] + tenths * SECOND // 10, *pose) is None
+    assert estimator.odometry_frame("r")[1] == stands
+    estimator.set_options(replace(options, outlier_threshold=0.4))
+    estimator.place(answered(estimator))  # with the same keyframes
+    assert estimator.odometry_frame("r")[1] == stands
