@@ -39,15 +39,17 @@ class Drift:
     step_orientation: float
     step_position: float
 
-    def after(self, steps: int, way: float) -> tuple[float, float]:
+    def after(self, steps: int, way: float, square_lever: float | None = None) -> tuple[float, float]:
         """Variances of orientation and position, rad² and m², beyond the keyframe.
 
         Args:
             steps: steps of odometry since the keyframe.
             way: distance from the keyframe, metres; over it the keyframe's error of orientation moves the position.
+            square_lever: mean square distance from where the steps were made, m²; default: that of steps straight on.
         """
-        orientation = self.orientation + steps * self.step_orientation
-        return orientation, self.position + steps * self.step_position + self.orientation * way**2
+        grown, lever = steps * self.step_orientation, way**2 / 3 if square_lever is None else square_lever
+        position = self.position + steps * self.step_position + self.orientation * way**2 + grown * lever
+        return self.orientation + grown, position
 
 
 UNKNOWN_DRIFT = Drift(math.nan, math.nan, math.nan, math.nan)
@@ -88,6 +90,11 @@ class OdometryFrame:
         """The frame so turned, with a body at ``odometry_position`` in it at ``position`` in the world, metres."""
         turned = quaternion.rotate(world_from_odometry, odometry_position)
         return cls(chain, world_from_odometry, quaternion.difference(position, turned), odometry_position)
+
+    def variances_at(self, odometry_position: Vector, steps: int) -> tuple[float, float]:
+        """Variances of orientation and position, rad² and m², at a position so many steps after the keyframe."""
+        lever = None if self.steps is None else self.steps.square_lever(odometry_position)
+        return self.drift.after(steps, math.dist(odometry_position, self.keyframe_position), lever)
 
     def place(self, odometry_position: Vector) -> Vector:
         """A point of the odometry's frame in the world, metres."""

@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from rotavg_ros.online.odometry.continuity import OdometrySample, angle_and_metres
+from rotavg_ros.online.quaternion import Vector
 
 
 @dataclass(frozen=True)
@@ -40,9 +43,22 @@ class OdometrySteps:
         self.moment = keyframe.stamp_ns, time_line
         self.count = int(size.number(keyframe, latest))
         self._size, self._from = size, latest
+        first, last = (np.array(sample.position or (0.0, 0.0, 0.0)) for sample in (keyframe, latest))
+        made_at = first + (np.arange(self.count)[:, None] + 0.5) / max(self.count, 1) * (last - first)
+        self._places, self._squares = made_at.sum(axis=0), float((made_at**2).sum())
 
     def go_on(self, sample: OdometrySample) -> None:
         """Take the next message."""
         if self._size.number(self._from, sample) >= 1:
             self.count += 1
             self._from = sample
+            place = np.array(sample.position or (0.0, 0.0, 0.0))
+            self._places += place
+            self._squares += float(place @ place)
+
+    def square_lever(self, position: Vector) -> float:
+        """Mean square distance of a position from where the steps were made, m²: over it their turns move it."""
+        if not self.count:
+            return 0.0
+        place = np.array(position)
+        return max(0.0, float(place @ place + (self._squares - 2 * place @ self._places) / self.count))

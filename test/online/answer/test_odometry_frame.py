@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online import Answer, EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
-from rotavg_ros.online.answer.odometry_frame import OdometryFrame
+from rotavg_ros.online.answer.odometry_frame import Drift, OdometryFrame
 
 SECOND = 1_000_000_000
 OPTIONS = EstimatorOptions(keyframe_angle=0, keyframe_distance=0, keyframe_interval_s=0.25)
@@ -235,6 +235,13 @@ def test_variances_grow_while_a_front_end_is_silent_but_not_while_the_robot_stan
         pose = run.odometry[last].as_quat().tolist(), run.odometry_position[last].tolist()
         assert estimator.add_odometry("r", run.stamps[last] + tenths * SECOND // 10, *pose) is None
     assert estimator.odometry_frame("r")[1] == stands
+    # Half a lap later all steps of that lap turn the robot about where they were made: √2 radii away on average.
+    across = run.odometry_position[last - LAP // 2]
+    levers = [float(((each - across) ** 2).sum()) for each in run.odometry_position[LAP + every : 2 * LAP : every]]
+    assert frame.steps.square_lever(tuple(across)) == pytest.approx(np.mean(levers), rel=0.1)
+    turns_alone = replace(frame, drift=Drift(0.0, 0.0, 1e-4, 0.0))
+    _, position = turns_alone.variances_at(tuple(run.odometry_position[last]), steps)
+    assert position == pytest.approx(steps * 1e-4 * 2 * 4.0**2, rel=0.2)  # though the robot is back where it began
     estimator.set_options(replace(options, outlier_threshold=0.4))
     estimator.place(answered(estimator))  # with the same keyframes
     assert estimator.odometry_frame("r")[1] == stands

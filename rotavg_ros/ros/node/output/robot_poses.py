@@ -140,7 +140,7 @@ def covariance(frame: OdometryFrame, steps: int, odometry_position: Vector) -> N
 
     For a robot that turns only about z, the variances of the other rotations and of the height are 0.
     """
-    orientation, position = frame.drift.after(steps, math.dist(odometry_position, frame.keyframe_position))
+    orientation, position = frame.variances_at(odometry_position, steps)
     spread = np.array([position] * 3 + [orientation] * 3)
     spread = np.where(np.isfinite(spread), spread, UNKNOWN_VARIANCE)
     if frame.is_planar:
