@@ -28,6 +28,10 @@ from rotavg_ros.bags.topics import (
 from rotavg_ros.datasets.files.graph_file import MAX_NODE_ID, GraphFile
 from rotavg_ros.datasets.interpolation import poses_at
 from rotavg_ros.datasets.planar import are_about_z, are_level
+from rotavg_ros.online import EstimatorOptions
+from rotavg_ros.online.odometry.data_time import DataTime
+from rotavg_ros.online.odometry.time_jumps import RUN_LENGTH
+from rotavg_ros.online.options import NANOSECONDS
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, ViewGraphError, where_possible
 
 # Largest difference between a stamp that names a keyframe and the stamp of its odometry message.
@@ -76,7 +80,8 @@ def read_graph_bag(path: str | Path) -> GraphFile:
     the body's frame by the bag's static transforms. From a damaged bag, everything that can be read is used.
 
     Raises:
-        BagReadError: an unreadable bag, one without edges, or one that needs odometry and has none.
+        BagReadError: an unreadable bag, one without edges, or one that needs odometry and has none, or odometry whose
+            time goes back.
     """
     with BagReader(path, salvage=True) as bag:
         if bag.topics.get(EDGE_ARRAY_TOPIC) != RELATIVE_ROTATION_ARRAY:
@@ -86,6 +91,7 @@ def read_graph_bag(path: str | Path) -> GraphFile:
             bag.require(ODOM_TOPIC, ODOMETRY)
             if not any(map(_is_sound, content.odometry)):
                 raise BagReadError(f"{path}: {ODOM_TOPIC} has no messages with a pose, so there are no keyframes")
+            _check_time(path, content.odometry)
         damage = bag.damage
     _check(path, content)
     try:
@@ -136,6 +142,28 @@ def _check(path: str | Path, content: _Content) -> None:
     for edge in content.edges:
         if edge.kind not in known:
             raise BagReadError(f"{path}: edge {edge.id} is of the unknown kind {edge.kind}")
+
+
+def _check_time(path: str | Path, odometry: list[_Pose]) -> None:
+    """Refuse odometry whose time goes back: in order of its stamps it would leap to and fro between two places.
+
+    Messages that are the same as one before are no harm, as in a recording of a bag in a loop, nor are stray ones.
+    """
+    options, time, known = EstimatorOptions(), DataTime(), set[tuple[float, ...]]()
+    in_a_row = 0
+    for row, (stamp_ns, position, rotation) in enumerate(odometry):
+        message = (stamp_ns, *position, *rotation)
+        now_ns = time.advance(stamp_ns, options.continuity_limits.lead_ns)
+        if now_ns is not None:
+            time.claimed_ns = None  # only the next message may confirm a stamp far ahead
+        back_ns = 0 if now_ns is None else now_ns - stamp_ns
+        in_a_row = in_a_row + 1 if back_ns > options.time_jump_ns and message not in known else 0
+        known.add(message)
+        if in_a_row == RUN_LENGTH:
+            raise BagReadError(
+                f"{path}: {ODOM_TOPIC}: time goes back by {back_ns / NANOSECONDS:.1f} s after {row + 1 - RUN_LENGTH} "
+                "messages, and a graph has room for one time; `rotavg replay` reads the bag, with a component for each"
+            )
 
 
 def _from_ids(content: _Content) -> GraphFile:

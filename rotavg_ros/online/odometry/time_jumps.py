@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rotavg_ros.online.measurements import OdometryMessage
 
 # Number of messages in a row that must agree before a jump is believed: stray ones, however old, change nothing.
-_RUN_LENGTH = 5
+RUN_LENGTH = 5
 # They count as consecutive if no step among them exceeds this many of the robot's usual steps: 5 s at 10 Hz. With a
 # smaller number, a pause at the wrong moment loses the messages before it; a larger one would work as well, since stray
 # stamps lie much farther apart.
@@ -55,7 +55,7 @@ class BackwardJumps:
         is_told = policy in KEEPS_TIME_LINE and message.robot in self._told
         if not is_told and int(taken_ns[-1]) - message.stamp_ns > threshold_ns:
             run.append(message)
-        if len(run) < _RUN_LENGTH:
+        if len(run) < RUN_LENGTH:
             return []
         self._told.add(message.robot)
         return self._runs.pop(message.robot)
