@@ -96,7 +96,7 @@ class Solving:
         """Do the work that the tick has left, once its answer is published."""
         started = time.perf_counter()
         work = self._estimator.go_on(self._budget.units(self.tick_budget_s))
-        self._budget.learn(time.perf_counter() - started, work)
+        self._budget.learn_rest(time.perf_counter() - started, work)
 
     def _tick_and_go_on(self) -> None:
         self.tick()

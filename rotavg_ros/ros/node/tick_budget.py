@@ -18,6 +18,7 @@ class TickBudget:
 
     def __init__(self) -> None:
         self._seconds_per_unit: deque[float] = deque(maxlen=_TICKS)
+        self._rest_s = self._rest_work = 0.0
 
     def units(self, seconds: float) -> float:
         """Units of work that fit into ``seconds``; before the first tick, by the default cost of a unit."""
@@ -25,6 +26,18 @@ class TickBudget:
         return seconds / costs
 
     def learn(self, seconds: float, work: float) -> None:
-        """Note that ``work`` units have taken ``seconds``."""
+        """Note that a tick of ``work`` units has taken ``seconds``."""
         if work >= _LEAST_WORK:
             self._seconds_per_unit.append(seconds / work)
+
+    def learn_rest(self, seconds: float, work: float) -> None:
+        """Note that ``work`` units of what a tick has left have taken ``seconds``.
+
+        Nearly all of that is the solver's, so small pieces add up. After a slow tick (the first one loads, or compiles)
+        all pieces are small: if they did not count, they would stay small for good.
+        """
+        if work > 0:
+            self._rest_s, self._rest_work = self._rest_s + seconds, self._rest_work + work
+        if self._rest_work >= _LEAST_WORK:
+            self.learn(self._rest_s, self._rest_work)
+            self._rest_s = self._rest_work = 0.0
