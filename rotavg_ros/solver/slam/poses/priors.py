@@ -9,7 +9,7 @@ from dataclasses import dataclass
 class PlacePriors:
     """Prior parameters of translations.
 
-    Lengths are in typical steps of odometry (the median of non-zero steps), so results do not depend on the unit.
+    Lengths are in typical steps of odometry (the median of those not on the spot), so the unit does not matter.
 
     Attributes:
         step: median of the standard deviation of the end of one typical step of odometry, per component; the variance
