@@ -75,6 +75,18 @@ class PoseStart:
         return replace(cls.at(pose), places=replace(places, chance=chance, weight=weight))
 
     @classmethod
+    def joining(cls, pose: PoseMode, believed: np.ndarray, doubted: np.ndarray) -> PoseStart:
+        """For the same labelling, with some closures ``(n,)`` believed, and some ``(d,)`` doubted."""
+        begun, held = cls.believing(pose, believed).places, cls.doubting(pose, doubted).places
+        is_doubted = np.zeros(len(begun.weight), dtype=bool)
+        is_doubted[doubted] = True
+        chance, weight = (
+            np.where(is_doubted, held.chance, begun.chance),
+            np.where(is_doubted, held.weight, begun.weight),
+        )
+        return replace(cls.at(pose), places=replace(begun, chance=chance, weight=weight))
+
+    @classmethod
     def kept(cls, problem: PoseProblem, kept: np.ndarray, noise: np.ndarray) -> PoseStart | None:
         """From kept labels and classes of places; None if another version of the solver kept them.
 

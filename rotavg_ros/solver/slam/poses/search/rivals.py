@@ -11,6 +11,7 @@ from rotavg_ros.solver.slam.poses.em.convergence import HELD, Ending
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses, likeliest_level
 from rotavg_ros.solver.slam.poses.em.start import USUAL, PoseStart
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.search.joins import joined_otherwise
 from rotavg_ros.solver.slam.poses.search.jumps import jumps_too_far, likeliest_jump, with_jump, without_odd_jumps
 from rotavg_ros.solver.slam.poses.search.runs import with_runs, without_runs
 from rotavg_ros.solver.slam.poses.search.settling import HOPELESS, SLACK, Rival, settled, settling
@@ -99,7 +100,7 @@ def _distinct(ended: Sequence[Rival], farthest: float) -> list[Rival]:
 
 
 def _with_other_runs(rivals: Sequence[Rival]) -> list[Rival]:
-    """The rivals that believing or doubting whole runs makes likelier.
+    """The rivals that are likelier with chains joined by other closures, or with whole runs believed or doubted.
 
     A rival is skipped if this changed nothing in another one with nearly the same labels.
     """
@@ -108,7 +109,7 @@ def _with_other_runs(rivals: Sequence[Rival]) -> list[Rival]:
     for rival in rivals:
         if any(rival.mode.holds_like(other.mode.state) for other in unmoved):
             continue
-        other = without_runs(with_runs(rival))
+        other = without_runs(with_runs(joined_otherwise(rival)))
         (unmoved if other is rival else found).append(other)
     return found
 

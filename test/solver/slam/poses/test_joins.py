@@ -1,0 +1,118 @@
+"""Robots that closures alone join: where a few wrong ones that agree are believed first, the others are found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros import ViewGraph
+from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
+from rotavg_ros.solver.slam.poses.em.start import PoseStart
+from rotavg_ros.solver.slam.poses.search.joins import joined_otherwise, other_joins
+from rotavg_ros.solver.slam.poses.search.settling import Rival
+from rotavg_ros.view_graph import EdgeKind
+
+from .test_poses import pose_mode
+
+# Metres between crossings, and the town's width; keyframes of each robot, a metre apart.
+BLOCK, SIDE, LENGTH = 15, 60, 280
+
+
+class Streets(NamedTuple):
+    """Two robots' graph, the true positions, and which edges are false or join the robots."""
+
+    graph: ViewGraph
+    position: np.ndarray
+    is_false: np.ndarray
+    joins: np.ndarray
+
+
+def two_in_a_town(seed: int, good: int = 5, false: int = 3) -> Streets:
+    """Two robots on the same streets, each with loops of its own; a run of false joins agrees on one displacement."""
+    rng = np.random.default_rng(seed)
+    turns, places = [], []
+    for _ in range(2):
+        place, heading, at = [], [], np.array(rng.integers(0, SIDE // BLOCK + 1, 2) * BLOCK)
+        while len(place) < LENGTH:
+            ways = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+            ahead = [way for way in ways if (at + BLOCK * way >= 0).all() and (at + BLOCK * way <= SIDE).all()]
+            way = ahead[rng.integers(len(ahead))]
+            place += [at + way * metre for metre in range(BLOCK)]
+            heading += [np.arctan2(way[1], way[0])] * BLOCK
+            at = at + BLOCK * way
+        places.append(np.c_[place, np.zeros(len(place))][:LENGTH])
+        turns.append(Rotation.from_rotvec(np.outer(heading[:LENGTH], [0, 0, 1.0])))
+    position = np.concatenate(places)
+    turn = Rotation.concatenate(turns)
+    edges: list[tuple[int, int, Rotation, np.ndarray, int, bool]] = []
+
+    def add(i: int, j: int, noise_deg: float, noise_m: float, kind: EdgeKind, moved: np.ndarray | None = None) -> None:
+        error = Rotation.from_rotvec([0, 0, rng.normal(0, np.radians(noise_deg))])
+        seen = position[j] if moved is None else position[j] + moved
+        shift = turn[i].inv().apply(seen - position[i]) + np.append(rng.normal(0, noise_m, 2), 0.0)
+        edges.append((i, j, turn[i].inv() * turn[j] * error, shift, kind, moved is not None))
+
+    for first in (0, LENGTH):
+        for i in range(first, first + LENGTH - 1):
+            add(i, i + 1, 0.3, 0.03, EdgeKind.ODOMETRY)
+        own = position[first : first + LENGTH]
+        pairs = np.argwhere(np.linalg.norm(own[:, None] - own, axis=2) < 2)
+        pairs = pairs[pairs[:, 1] - pairs[:, 0] > 40] + first
+        for i, j in pairs[rng.choice(len(pairs), min(30, len(pairs)), replace=False)]:
+            add(i, j, 0.8, 0.08, EdgeKind.LOOP_CLOSURE)
+    apart = np.linalg.norm(position[:LENGTH, None] - position[LENGTH:], axis=2)
+    near = np.argwhere(apart < 2)
+    for i, j in near[rng.choice(len(near), good, replace=False)]:
+        add(i, LENGTH + j, 0.8, 0.08, EdgeKind.LOOP_CLOSURE)
+    far = np.argwhere(apart[:-false, :-false] > 20)
+    i, j = far[rng.integers(len(far))]
+    for step in range(false):
+        add(i + step, LENGTH + j + step, 0.8, 0.08, EdgeKind.LOOP_CLOSURE, position[i] - position[LENGTH + j])
+    source, target, rotation, translation, kind, is_false = zip(*edges, strict=True)
+    graph = ViewGraph.create(
+        source,
+        target,
+        source_from_target=np.array([each.as_quat() for each in rotation]),
+        translation=np.array(translation),
+        kind=kind,
+    )
+    return Streets(graph, position, np.array(is_false), (np.array(source) < LENGTH) & (np.array(target) >= LENGTH))
+
+
+def placed_by_false(streets: Streets) -> Rival:
+    """The labelling whose false joins are believed, and no others."""
+    pose = pose_mode(streets.graph)
+    edge = pose.problem.closures
+    false, good = streets.is_false[edge], streets.joins[edge] & ~streets.is_false[edge]
+    start = PoseStart.joining(pose, np.flatnonzero(false), np.flatnonzero(good))
+    return Rival(pose.problem.mode, estimate_poses(pose.problem, hold=True, start=replace(start, solves=12)))
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.large) for seed in range(1, 6))])
+def test_a_robot_is_placed_by_the_joins_that_make_all_likelier(seed: int) -> None:
+    streets = two_in_a_town(seed)
+    rival = placed_by_false(streets)
+    edge = rival.pose.problem.closures
+    false, good = streets.is_false[edge], streets.joins[edge] & ~streets.is_false[edge]
+    right = rival.pose.solved.places.right
+    assert (right[false] > 0.5).all() and (right[good] < 0.5).all()
+    first = other_joins(rival.pose)[0]
+    assert set(first.believed) == set(np.flatnonzero(good)) and set(first.doubted) == set(np.flatnonzero(false))
+    placed = joined_otherwise(rival)
+    right = placed.pose.solved.places.right
+    assert placed.cost < rival.cost
+    assert (right[good] > 0.5).all() and (right[false] < 0.5).all()
+    # From there no other group makes it likelier.
+    assert joined_otherwise(placed) is placed
+
+
+def test_one_chain_has_no_joins() -> None:
+    streets = two_in_a_town(0)
+    first = np.flatnonzero((streets.graph.source.numpy() < LENGTH) & (streets.graph.target.numpy() < LENGTH))
+    alone = replace(streets.graph.select_edges(torch.from_numpy(first)), num_nodes=LENGTH)
+    assert other_joins(pose_mode(alone)) == []
