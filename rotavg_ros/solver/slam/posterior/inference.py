@@ -11,6 +11,7 @@ from rotavg_ros.solver.slam.posterior.em import polish, step
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.moves import noise, slips
 from rotavg_ros.solver.slam.posterior.moves.flips import flipped
+from rotavg_ros.solver.slam.posterior.moves.joins import propose_joins
 from rotavg_ros.solver.slam.posterior.moves.runs import propose_rejected_runs
 from rotavg_ros.solver.slam.posterior.moves.settling import propose_settling
 from rotavg_ros.solver.slam.posterior.moves.splits import propose_splits
@@ -175,6 +176,7 @@ def proposals(mode: Mode) -> Iterator[Proposal]:
         yield from noise.propose_worse_odometry(mode)
     if "rejected-runs" not in without:
         yield from propose_rejected_runs(mode)
+        yield from propose_joins(mode)
     if "slips" not in without:
         yield from slips.propose_slips(mode)
     if not without & {"slips", "shifts"}:

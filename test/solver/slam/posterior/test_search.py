@@ -353,8 +353,8 @@ STRUCTURAL = {
     "moves/slips": {
         "_FARTHEST_SHIFT",
         "LEAST_WITNESSES",
-        "_AGREE",
-        "_AGREE_ANGLE",
+        "AGREE",
+        "AGREE_ANGLE",
         "OPTIMISM",
         "SETTLING",
         "SAME_PLACE",

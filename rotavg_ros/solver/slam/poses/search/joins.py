@@ -28,7 +28,7 @@ class Join(NamedTuple):
 
     Attributes:
         believed: closures that agree about where one lies beside the other.
-        doubted: all other closures that join one of the two to any chain, the one with fewer such closures.
+        doubted: all other closures that join one of the two to any chain.
     """
 
     believed: np.ndarray
@@ -41,10 +41,11 @@ def joined_otherwise(rival: Rival) -> Rival:
         return rival
     tried: set[bytes] = set()
     for _ in range(_MAX_GROUPS):
-        for join in other_joins(rival.pose)[:_MAX_GROUPS]:
-            if join.believed.tobytes() in tried:
+        for join in other_joins(rival.pose)[: 2 * _MAX_GROUPS]:
+            key = join.believed.tobytes() + b"|" + join.doubted.tobytes()
+            if key in tried:
                 continue
-            tried.add(join.believed.tobytes())
+            tried.add(key)
             placed = moved(rival, PoseStart.joining(rival.pose, *join))
             if placed.cost < rival.cost - LEAST_GAIN:
                 rival = placed
@@ -55,7 +56,11 @@ def joined_otherwise(rival: Rival) -> Rival:
 
 
 def other_joins(pose: PoseMode) -> list[Join]:
-    """Groups of closures that would place a chain otherwise than it lies, those of most closures first."""
+    """Groups of closures that would place a chain otherwise than it lies, those of most closures first.
+
+    Either chain may be the one that is misplaced, so a group may be there twice; not where it has fewer runs than the
+    closures that would have to be wrong.
+    """
     problem, places, told = pose.problem, pose.solved.places, pose.problem.told
     closure, drawn, k = problem.mode.problem.closure, problem.drawn, problem.turns
     chain = np.stack((drawn.chain[drawn.source[closure]], drawn.chain[drawn.target[closure]]), axis=1)
@@ -77,7 +82,11 @@ def other_joins(pose: PoseMode) -> list[Join]:
         seed = int(np.argmax(np.where(is_left, (alike & is_left).sum(axis=1), -1)))
         members = alike[seed] & is_left
         is_left &= ~members
-        fewest = min(pair[seed], key=lambda each: int((chain[joins] == each).sum()))
-        others = joins[(chain[joins] == fewest).any(axis=1)]
-        found.append(Join(could[members], np.setdiff1d(others, could[members])))
+        believed = could[members]
+        for moving in pair[seed]:
+            doubted = np.setdiff1d(joins[(chain[joins] == moving).any(axis=1)], believed)
+            contradicted = doubted[places.right[doubted] > _WRONG]
+            # The closures of a run repeat each other whether right or wrong, so a run counts once.
+            if len(np.unique(told.run[believed])) >= len(np.unique(told.run[contradicted])):
+                found.append(Join(believed, doubted))
     return found

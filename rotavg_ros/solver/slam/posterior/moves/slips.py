@@ -23,7 +23,7 @@ SETTLING = 4
 # Decrease of F, nats, that relabelling and bending may at most add to what the turned-back residuals predict.
 OPTIMISM = 10.0
 # A turn explains a closure whose error differs from it by at most this many standard deviations, or this angle, rad.
-_AGREE, _AGREE_ANGLE = 3.0, np.radians(2.0)
+AGREE, AGREE_ANGLE = 3.0, np.radians(2.0)
 # Least number of false closures for a slip: a single one costs less than a slip.
 LEAST_WITNESSES = 2
 # Largest number of segments by which a slip is shifted.
@@ -71,7 +71,7 @@ class Witnesses:
 
     def agreeing(self, turn: np.ndarray, mode: Mode) -> np.ndarray:
         """``(C,)`` bool, false closures whose error is about ``turn`` ``(4,)``."""
-        tolerance = 2 * _AGREE**2 * mode.problem.components * mode.state.noise.closure_variance + _AGREE_ANGLE**2
+        tolerance = 2 * AGREE**2 * mode.problem.components * mode.state.noise.closure_variance + AGREE_ANGLE**2
         difference = 2 * np.arccos(np.minimum(np.abs(turn @ self.turned), 1.0))
         return np.asarray((difference**2 < tolerance) & self.can_tell & mode.is_false)
 

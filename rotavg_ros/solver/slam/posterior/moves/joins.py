@@ -1,0 +1,97 @@
+"""Moves that turn a chain of odometry as a whole: closures alone join it to others, and some of these say otherwise.
+
+Those that are good hold the chain, so any other one is judged false because of them, whether or not false ones hold it.
+No single label and no slip turns a whole chain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.slam.posterior.em import settle
+from rotavg_ros.solver.slam.posterior.left_out import rough_cost
+from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
+from rotavg_ros.solver.slam.posterior.moves.slips import (
+    AGREE,
+    AGREE_ANGLE,
+    OPTIMISM,
+    SETTLING,
+    trusted_after_turn,
+    turned_by,
+)
+from rotavg_ros.solver.slam.posterior.state import State
+
+
+def propose_joins(mode: Mode) -> Iterator[Proposal]:
+    """Proposes to turn a chain, and all that good closures hang on it, as a group of false closures says."""
+    problem, graph, closure = mode.problem, mode.problem.graph, mode.problem.closure
+    number = np.unique(graph.chain, return_inverse=True)[1]
+    ends = np.stack((number[graph.source[closure]], number[graph.target[closure]]))
+    joins = ends[0] != ends[1]
+    is_left = joins & mode.is_false & ~np.isinf(problem.log_odds[closure])
+    if not is_left.any():
+        return
+    turned = quaternion_rows.residual(mode.state.correction, problem.measured, graph.source, graph.target)[:, closure]
+    turned = np.where(ends[0] < ends[1], turned, quaternion_rows.inverse(turned))
+    low, high = np.sort(ends, axis=0)
+    variance = mode.state.noise.closure_variance + mode.state.others.predicted[closure]
+    before = rough_cost(problem, mode.state)
+    for _ in range(problem.limits.slips):
+        if not is_left.any():
+            break
+        groups = []
+        for each in np.flatnonzero(is_left):
+            difference = 2 * np.arccos(np.minimum(np.abs(turned[:, each] @ turned), 1.0))
+            square = AGREE**2 * problem.components * (variance + variance[each]) + AGREE_ANGLE**2
+            groups.append(joins & (low == low[each]) & (high == high[each]) & (difference**2 < square))
+        size = [int((group & is_left).sum()) for group in groups]
+        best = int(np.argmax(size))
+        seed, agrees = int(np.flatnonzero(is_left)[best]), groups[best]
+        is_left &= ~agrees
+        held = joins & ~mode.is_false & ~((low == low[seed]) & (high == high[seed]) & ~agrees)
+        for chains in _sides(int(number.max()) + 1, ends, ends[:, held], (int(low[seed]), int(high[seed]))):
+            state = _turned(mode, chains[:, number], turned[:, [seed]])
+            predicted = rough_cost(problem, state) - before - OPTIMISM
+            yield Proposal("join otherwise", predicted, partial(settle, problem, state, SETTLING), problem.limits.slack)
+
+
+def _sides(count: int, ends: np.ndarray, held: np.ndarray, pair: tuple[int, int]) -> list[np.ndarray]:
+    """``(2, n)`` bool each: of n = ``count`` chains, those that turn against others, and these others.
+
+    If without the pair's own closures no good ones join its two chains, each turns with all that hangs on it. Otherwise
+    either of the two may be the one that good closures to others misplace, and it turns alone.
+
+    Args:
+        count: number of chains.
+        ends: ``(2, C)`` chains that closures join.
+        held: ``(2, H)`` the same of good ones, without those between the pair that the turn makes false.
+        pair: lower and higher chain; the higher one turns against the lower one.
+    """
+
+    def parts(joined: np.ndarray) -> np.ndarray:
+        links = coo_array((np.ones(joined.shape[1]), joined), shape=(count, count))
+        return np.asarray(connected_components(links, directed=False)[1])
+
+    component, part = parts(ends), parts(held)
+    is_near = component == component[pair[0]]
+    lower, higher = (np.arange(count) == each for each in pair)
+    if part[pair[0]] == part[pair[1]]:
+        return [np.stack((higher, is_near & ~higher)), np.stack((is_near & ~lower, lower))]
+    higher = part == part[pair[1]]
+    return [np.stack((higher, is_near & ~higher))]
+
+
+def _turned(mode: Mode, sides: np.ndarray, turn: np.ndarray) -> State:
+    """The state with one side ``(2, K)`` turned against the other: the one without a root, which is fixed."""
+    first, second = sides
+    if first[mode.problem.graph.roots].any():
+        first, turn = second, quaternion_rows.inverse(turn)
+    state = turned_by(mode, first, turn)
+    return replace(state, trusted=trusted_after_turn(mode, state))
