@@ -81,7 +81,7 @@ def _of_mode(pose: PoseMode) -> Poses:
     variance = drawn.variance(own, apart, problem.mean_turn(pose.state.noise))
     between = (1 - passed) * shifts[drawn.above] + passed * shifts[drawn.below]
     segment = problem.segment_of_node
-    spread = pose.solved.way.length[: drawn.num_segments] * pose.state.noise.way + problem.jumps
+    spread = pose.state.noise.of_odometry(pose.solved.way.travelled[: drawn.num_segments]) + problem.jumps
     between += passed * (1 - passed) * np.where(segment >= 0, spread[np.maximum(segment, 0)], 0.0)
     score, rotation = (outlier_scores(drawn, probability) for probability in _scores(pose))
     if problem.jump is not None:
@@ -109,7 +109,7 @@ def _precision(pose: PoseMode) -> np.ndarray:
     turn *= problem.drawn_steps.share
     slipped = drawn.edge_values((drawn.is_odometry & ~problem.mode.state.is_good).astype(np.float64))
     slip = (problem.priors.slip * problem.typical) ** 2
-    shift = noise.way * problem.lengths_passed + slipped * drawn.share_of_segment * slip
+    shift = noise.of_odometry(problem.travelled) + slipped * drawn.share_of_segment * slip
     if problem.jump is not None:
         shift += problem.jump
     turn[edges] = mean_square[closure] / pose.solved.rotation_weight[closure, 0]
@@ -144,10 +144,10 @@ def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray
     way = problem.displacements(orientation)
     position = state.position[drawn.above] + way.way
     passed = np.zeros(len(position))
-    behind, whole = way.passed[inner], way.length[segment]
+    behind, whole = (state.noise.of_odometry(each) for each in (way.passed[inner], way.travelled[segment]))
     if problem.jump is not None:
-        behind = state.noise.way * behind + problem.drawn_steps.up_to_nodes(problem.jump)[inner]
-        whole = state.noise.way * whole + problem.jumps[segment]
+        behind += problem.drawn_steps.up_to_nodes(problem.jump)[inner]
+        whole += problem.jumps[segment]
     passed[inner] = behind / np.maximum(whole, np.finfo(np.float64).tiny)
     position[inner] += passed[inner, None] * (ends - way.displacement[segments])[segment]
     return orientation, position, passed

@@ -14,6 +14,8 @@ from rotavg_ros.solver.slam.posterior.densities import log_half_turn
 
 # Classes of good closures come first.
 GOOD = 2
+# Index of the class of good closures in the tails.
+TAILS = 1
 # Index, from the end, of the class of closures that join the same wrong places as another one.
 REPEATS = -2
 # Relative weight of a row that is not to pull: the system stays solvable.

@@ -37,9 +37,9 @@ class Displacements:
         displacement: ``(E, 3)`` of target from source in the world, as measured.
         at_source, at_target: ``(E, 3)`` A and B.
         bridge: ``(E, 3, 3)`` ∫ (‖d‖² I − d dᵀ) dq, m² per rad² a step; 0 for edges that are not segments.
-        length: ``(E,)`` metres travelled.
+        travelled: ``(E, 2)`` metres, and steps.
         lever: ``(N, 3)`` ∫ d dq from the preceding key node up to each node.
-        passed: ``(N,)`` metres travelled from the preceding key node up to each node.
+        passed: ``(N, 2)`` metres, and steps, from the preceding key node up to each node.
         way: ``(N, 3)`` displacement from the preceding key node.
     """
 
@@ -47,7 +47,7 @@ class Displacements:
     at_source: np.ndarray
     at_target: np.ndarray
     bridge: np.ndarray
-    length: np.ndarray
+    travelled: np.ndarray
     lever: np.ndarray
     passed: np.ndarray
     way: np.ndarray
@@ -121,7 +121,7 @@ class DrawnSteps:
     Args:
         graph: N nodes and M edges.
         translation: ``(M, 3)`` position of the target in the source's frame, metres.
-        length: ``(M,)`` metres to which each edge's variance is proportional.
+        travelled: ``(M, 2)`` metres, and steps, of each edge.
         drawn: the same graph, contracted into S segments.
         steps: ``(S,)`` variance of the segments, in units of that of one step.
         by_turns: ``(M,)`` part of each edge's variance that is proportional to its squared turns.
@@ -134,7 +134,7 @@ class DrawnSteps:
         self,
         graph: ViewGraph,
         translation: np.ndarray,
-        length: np.ndarray,
+        travelled: np.ndarray,
         drawn: ClosureGraph,
         steps: np.ndarray,
         by_turns: np.ndarray,
@@ -169,9 +169,8 @@ class DrawnSteps:
         self._outside_is_forward = drawn.is_forward[self._num_segments :, None]
         older = np.where(self._outside_is_forward[:, 0], graph.source.numpy()[outside], graph.target.numpy()[outside])
         self._measured_outside = older, ways_by(graph, outside, translation[outside], older)
-        passed = self._so_far(length[self._edge, None])
-        self._passed = self._at_nodes(passed)[:, 0]
-        self._length = np.concatenate((self._whole(length[self._edge, None])[:, 0], length[outside]))
+        self._passed = self._at_nodes(self._so_far(travelled[self._edge]))
+        self._travelled = np.concatenate((self._whole(travelled[self._edge]), travelled[outside]))
 
     def displacements(self, body_from_world: np.ndarray) -> Displacements:
         """At orientations ``(N, 4)``."""
@@ -190,7 +189,7 @@ class DrawnSteps:
         at_source[self._num_segments :] = np.where(self._outside_is_forward, outside, 0.0)
         at_target[self._num_segments :] = np.where(self._outside_is_forward, 0.0, outside)
         return Displacements(
-            at_source + at_target, at_source, at_target, bridge, self._length, lever, self._passed, way
+            at_source + at_target, at_source, at_target, bridge, self._travelled, lever, self._passed, way
         )
 
     def up_to_nodes(self, of_edge: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, ways_passed
+from rotavg_ros.solver.algebra.odometry_lengths import ways_passed
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.poses.answer import Poses
 from rotavg_ros.solver.slam.poses.closures import Places
@@ -126,15 +126,15 @@ class PoseMemory:
         poses, noise = self.poses, self.noise
         assert graph.translation is not None
         steps = graph.steps.numpy()
-        passed = lengths_passed(ways_passed(graph.translation[new].numpy()), steps[new], self.pose.problem.typical)
+        own = noise.of_odometry(np.stack((ways_passed(graph.translation[new].numpy()), steps[new]), axis=1))
         # The way from its anchor to a node turns with the anchor's heading and with the headings of its own steps.
         way = np.linalg.norm(position[self.num_nodes :] - position[growth.anchor], axis=1)
         turned = self.step_variance * growth.along(steps[growth.edge])
         lever = (poses.variance[growth.anchor] + turned / WALK) * way**2 * ACROSS
-        shifted = lever + noise.way * growth.along(passed[growth.edge - self.num_edges])
+        shifted = lever + growth.along(own[growth.edge - self.num_edges])
         variance = np.append(poses.variance, poses.variance[growth.anchor] + turned)
         position_variance = np.append(poses.position_variance, poses.position_variance[growth.anchor] + shifted)
-        precision = np.stack((1 / (self.step_variance * steps[new]), 1 / (noise.way * passed)), axis=1)
+        precision = np.stack((1 / (self.step_variance * steps[new]), 1 / own), axis=1)
         nothing = np.zeros(len(new))
         alone = _laid_on(self.alone, growth)
         grown_poses = replace(

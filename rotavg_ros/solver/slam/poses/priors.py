@@ -16,7 +16,10 @@ class PlacePriors:
             grows with the distance travelled.
         step_spread: standard deviation of its logarithm: small, since odometry with arbitrary errors would be
             compatible with every false closure.
-        largest_step: upper bound of that standard deviation, for when everything is at one place.
+        still: median of the standard deviation of the end of any step, however short, per component; that variance is
+            added.
+        still_spread: standard deviation of its logarithm.
+        largest_step: upper bound of both standard deviations, for when everything is at one place.
         closure: median of the standard deviation of a good closure's translation.
         closure_spread: standard deviation of its logarithm.
         relative: median of a good closure's translation error relative to its length.
@@ -43,6 +46,8 @@ class PlacePriors:
 
     step: float = 0.05
     step_spread: float = 0.7
+    still: float = 0.01
+    still_spread: float = 1.0
     largest_step: float = 0.3
     closure: float = 1.0
     closure_spread: float = 1.0

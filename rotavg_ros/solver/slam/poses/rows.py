@@ -9,7 +9,7 @@ import torch
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, typical_length, ways_passed
+from rotavg_ros.solver.algebra.odometry_lengths import typical_length, ways_passed
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.algebra.sparse.block_system import BlockEquations
@@ -89,9 +89,9 @@ class PoseProblem:
         return typical_length(self.way, self.graph.steps.numpy(), self.graph.is_odometry.numpy())
 
     @cached_property
-    def lengths_passed(self) -> np.ndarray:
-        """``(M,)`` metres to which each edge's variance is proportional."""
-        return lengths_passed(self.way, self.graph.steps.numpy(), self.typical)
+    def travelled(self) -> np.ndarray:
+        """``(M, 2)`` metres, and steps, of each edge."""
+        return np.stack((self.way, self.graph.steps.numpy()), axis=1)
 
     @cached_property
     def bases(self) -> tuple[np.ndarray, np.ndarray]:
@@ -175,6 +175,11 @@ class PoseProblem:
         return self.mode.problem.system(noise if noise.run_steps > 0 else replace(noise, run_steps=RUN_STEPS[-1]))
 
     @property
+    def steps_err(self) -> bool:
+        """Whether a part of the error of odometry's shifts does not depend on the steps' lengths."""
+        return "step-errors" not in self.mode.problem.without
+
+    @property
     def turns_share(self) -> bool:
         """Whether turns of closures that are near each other err alike."""
         return self.mode.state.noise.run_steps > 0
@@ -203,8 +208,9 @@ class PoseProblem:
         noise, priors, typical = self.mode.state.noise, self.priors, self.typical
         way, closure = priors.step**2 * typical, (priors.closure * typical) ** 2
         own, common = (1 - priors.common) * closure, priors.common * closure
-        step = noise.step_variance
-        return PoseNoise(step, noise.closure_variance, way, own, priors.relative**2, common, step)
+        turn = noise.step_variance
+        step = (priors.still * typical) ** 2 if self.steps_err else _LEAST_LENGTH * typical * way
+        return PoseNoise(turn, noise.closure_variance, way, own, priors.relative**2, common, step, turn)
 
     @cached_property
     def slipped(self) -> np.ndarray:
@@ -343,7 +349,7 @@ class PoseProblem:
     def drawn_steps(self) -> DrawnSteps:
         """Odometry's steps, in the order of the segments."""
         by_turns = self.mode.problem.by_turns(self.mode.state.noise)
-        return DrawnSteps(self.graph, self.lengths, self.lengths_passed, self.drawn, self.steps, by_turns)
+        return DrawnSteps(self.graph, self.lengths, self.travelled, self.drawn, self.steps, by_turns)
 
     def displacements(self, body_from_world: np.ndarray) -> Displacements:
         """Displacements at orientations ``(N, 4)``."""
@@ -399,7 +405,7 @@ class PoseProblem:
         drawn, num_segments = self.drawn, self.drawn.num_segments
         unit = np.eye(self.shifts)
         noise = state.noise
-        variance = noise.way * np.maximum(way.length, _LEAST_LENGTH * self.typical)
+        variance = noise.of_odometry(way.travelled)
         slipped = drawn.is_odometry & ~self.mode.state.is_good
         variance += np.where(slipped, (self.priors.slip * self.typical) ** 2, 0.0)
         variance[:num_segments] += self.jumps

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ class PoseNoise:
         closure: m², of a good closure's translation.
         relative: growth of that variance per squared length: some front ends measure directions rather than lengths.
         common: m², additional variance of the error shared by closures near each other.
+        step: m² per step of odometry, however long: scans are matched as well from far as from near.
         tilt: rad², of one step of odometry about any other axis, which gravity may hold. Equal to ``turn`` where no
             vertical is known.
     """
@@ -28,17 +29,22 @@ class PoseNoise:
     closure: float
     relative: float
     common: float
+    step: float
     tilt: float
 
     @property
     def logarithms(self) -> np.ndarray:
-        """``(7,)``."""
-        return np.log([self.turn, self.closure_turn, self.way, self.closure, self.relative, self.common, self.tilt])
+        """``(8,)``."""
+        return np.log(astuple(self))
 
     @classmethod
     def of(cls, logarithms: np.ndarray) -> PoseNoise:
-        """From ``(7,)``."""
+        """From ``(8,)``."""
         return cls(*np.exp(logarithms).tolist())
+
+    def of_odometry(self, travelled: np.ndarray) -> np.ndarray:
+        """``(…,)`` m² per component, variance of odometry that has travelled ``(…, 2)`` metres, and steps."""
+        return np.asarray(self.way * travelled[..., 0] + self.step * travelled[..., 1])
 
     def of_closures(self, square_length: np.ndarray | float) -> np.ndarray:
         """m² per component, total variance of good closures' translations of this squared length, m²."""
@@ -47,7 +53,8 @@ class PoseNoise:
     def of_shifts_times(self, of_odometry: float, of_closures: float) -> PoseNoise:
         """The noise with scaled variances of shifts, except the part proportional to length."""
         closure, common = of_closures * self.closure, of_closures * self.common
-        return replace(self, way=of_odometry * self.way, closure=closure, common=common)
+        way, step = of_odometry * self.way, of_odometry * self.step
+        return replace(self, way=way, step=step, closure=closure, common=common)
 
 
 @dataclass(frozen=True)

@@ -176,6 +176,7 @@ def proposals(mode: Mode) -> Iterator[Proposal]:
         yield from noise.propose_worse_odometry(mode)
     if "rejected-runs" not in without:
         yield from propose_rejected_runs(mode)
+    if "joins" not in without:
         yield from propose_joins(mode)
     if "slips" not in without:
         yield from slips.propose_slips(mode)

@@ -155,14 +155,16 @@ class _System:
         position = np.zeros((len(anchor), 3)) if laid.position is None else laid.position
         way = position - position[anchor]
         steps = growth.along(graph.steps.numpy()[growth.edge])
-        length = np.zeros(len(growth.edge))
+        moved = np.zeros(len(growth.edge))
         if laid.position is not None and graph.translation is not None:
             step = graph.translation[torch.from_numpy(growth.edge)]
-            length = growth.along(torch.linalg.vector_norm(step, dim=1).nan_to_num().numpy())
+            metres = torch.linalg.vector_norm(step, dim=1).nan_to_num().numpy()
+            own = np.stack((metres, graph.steps.numpy()[growth.edge]), axis=1)
+            moved = growth.along(noise.of_odometry(own))
         turned = noise.turn * steps
         lever = turned / WALK * (way[linear.num_nodes :] ** 2).sum(axis=1) * ACROSS
         along = np.zeros((2, len(anchor)))
-        along[:, linear.num_nodes :] = turned, noise.way * length + lever
+        along[:, linear.num_nodes :] = turned, moved + lever
         source, target = graph.source[edge], graph.target[edge]
         body_from_world = laid.body_from_world
         expected = rotations.multiply(graph.target_from_source[edge].double(), body_from_world[source])

@@ -97,7 +97,7 @@ class Linear:
             problem.components,
             None,
             None,
-            PoseNoise(noise.step_variance, noise.closure_variance, 0.0, 0.0, 0.0, 0.0, noise.step_variance),
+            PoseNoise(noise.step_variance, noise.closure_variance, 0.0, 0.0, 0.0, 0.0, 0.0, noise.step_variance),
             int(is_good.sum()),
             int((~is_good).sum()),
             1.0,
@@ -117,8 +117,10 @@ class Linear:
         noise = replace(pose.state.noise, turn=turn, tilt=turn, closure_turn=closure)
         turns, shifts = problem.bases
         segment = problem.segment_of_node
-        length = np.where(segment >= 0, solved.way.length[np.maximum(segment, 0)], 0.0)
-        passed = np.where(segment >= 0, solved.way.passed / np.maximum(length, np.finfo(np.float64).tiny), 0.0)
+        inside = segment >= 0
+        whole = np.where(inside, noise.of_odometry(solved.way.travelled[np.maximum(segment, 0)]), 0.0)
+        up_to = noise.of_odometry(solved.way.passed)
+        passed = np.where(inside, up_to / np.maximum(whole, np.finfo(np.float64).tiny), 0.0)
         between = drawn.fraction * (1 - drawn.fraction) * drawn.length * noise.turn
         good = float(solved.places.right.sum())
 
@@ -130,7 +132,7 @@ class Linear:
             drawn.above,
             drawn.below,
             np.stack((drawn.fraction, passed)),
-            np.stack((between, passed * (1 - passed) * length * noise.way)),
+            np.stack((between, passed * (1 - passed) * whole)),
             problem.equations.num_blocks,
             turns.shape[1],
             turns,

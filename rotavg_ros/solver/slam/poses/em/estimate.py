@@ -64,7 +64,7 @@ def estimate_poses(
         ending: when to end before convergence.
     """
     is_good = problem.mode.state.is_good[problem.mode.problem.closure]
-    judge = Judge(problem.told, problem.turns, problem.priors, is_good if hold else None)
+    judge = judge_of(problem, is_good if hold else None)
     state = along_odometry(problem, level) if start is None else start.state
     places, is_new = _nothing_known(problem, state, judge), np.ones(len(is_good), dtype=bool)
     if start is not None:
@@ -98,6 +98,12 @@ def estimate_poses(
     judge = replace(judge, told=replace(judge.told, rotation_variance=used))
     in_order = judge(solved.predictions, solved.maps, solved.places.chance, solved.scale, in_order=True)
     return PoseMode(problem, solved, translation_cost(problem, solved, in_order), first)
+
+
+def judge_of(problem: PoseProblem, held: np.ndarray | None = None) -> Judge:
+    """The judge of a labelling's closures, whose rotations' labels ``(C,)`` may be held."""
+    counts_tails = "counted-tails" not in problem.mode.problem.without
+    return Judge(problem.told, problem.turns, problem.priors, held, counts_tails)
 
 
 def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge) -> Solved:
@@ -165,7 +171,7 @@ def likeliest_level(usual: PoseMode) -> Level:
         usual: the same labelling, begun with the prior variances.
     """
     problem, told = usual.problem, [usual.first]
-    judge = Judge(problem.told, problem.turns, problem.priors)
+    judge = judge_of(problem)
     for level in _LEVELS[1:]:
         state = along_odometry(problem, level)
         told.append(_log_likely(problem, _solve(problem, state, _nothing_known(problem, state, judge), judge)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,12 +14,16 @@ from rotavg_ros.solver.slam.poses.solved import Solved
 from rotavg_ros.solver.slam.poses.state import PoseNoise
 from rotavg_ros.solver.slam.posterior.em import likeliest_variance
 
+# Variances that are estimated each by itself; those of odometry's shifts, which are estimated together, by how many
+# steps at most, and the change that ends them.
+_ALONE, _OF_SHIFTS = np.array([0, 1, 3, 4, 5, 7]), np.array([2, 6])
+_SCORING_STEPS, _SCORED = 20, 1e-3
 # Each variance's own prior: median and standard deviation of the logarithm of its root.
 _Prior = tuple[float, float]
 
 
 def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
-    """All variances, each from its part of the residuals (Harville 1977), under their priors."""
+    """All variances, from their parts of the residuals (Harville 1977), under their priors."""
     noise, places = solved.state.noise, solved.places
     k, segments = problem.turns, np.flatnonzero(~problem.slipped & (problem.jumps == 0))
     redundancy = solved.factor.redundancy[segments]
@@ -31,8 +36,6 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
         squares = np.matmul(pulled.transpose(0, 2, 1), np.matmul(own, pulled)).sum()
         return np.array([squares, np.trace(np.matmul(own, left_over), axis1=1, axis2=2).sum()])
 
-    unit = np.eye(problem.shifts)
-    by_way = by_shifts(noise.way * solved.way.length[segments, None, None] * unit)
     bent = (problem.bent(solved.way) * problem.tailed[:, None, None])[:, segments]
     left, turns = solved.left[segments, :k, 0], redundancy[:, :k, :k]
 
@@ -47,13 +50,20 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     runs = slice(len(problem.drawn.source), None)
     alike = (solved.left[runs, k:] ** 2).sum(), np.trace(solved.factor.redundancy[runs, k:, k:], axis1=1, axis2=2).sum()
     used, priors = np.exp(noise.logarithms), priors_of(problem, noise)
-    found = np.stack((by_turns, by_closures[0], by_way, *by_closures[1:], alike, by_tilts))
-    found[:, 0] *= used
+    found = np.stack((by_turns, *by_closures, alike, by_tilts))
+    found[:, 0] *= used[_ALONE]
 
     def likeliest(told: np.ndarray, number: int) -> float:
         return likeliest_variance(told[0], max(told[1], 0.0), float(np.log(used[number])), *priors[number])
 
-    noise = PoseNoise.of(np.log([likeliest(told, number) for number, told in enumerate(found)]))
+    logarithms = noise.logarithms
+    logarithms[_ALONE] = np.log([likeliest(told, number) for number, told in zip(_ALONE, found, strict=True)])
+    total = np.trace(solved.covariance[segments], axis1=1, axis2=2) / problem.shifts
+    told = (pulled**2).sum(axis=(1, 2)) * total**2, np.trace(left_over, axis1=1, axis2=2) * total
+    logarithms[_OF_SHIFTS] = _likeliest_parts(
+        told, total, solved.way.travelled[segments], noise.logarithms[_OF_SHIFTS], [priors[each] for each in _OF_SHIFTS]
+    )
+    noise = PoseNoise.of(logarithms)
     if problem.drift_axis is None or noise.tilt > noise.turn:
         # A larger variance of tilts is not allowed: it would make room for false closures.
         alone = likeliest(found[0] + found[-1], 0)
@@ -63,7 +73,46 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     farthest = problem.priors.largest_step**2 * problem.typical
     common = min(noise.common, most / (1 - most) * noise.closure)
     tilt = max(noise.tilt, LEAST_TILT**2 * noise.turn)
-    return replace(noise, common=common, way=min(noise.way, farthest), tilt=tilt)
+    way, step = min(noise.way, farthest), min(noise.step, farthest * problem.typical)
+    step = step if problem.steps_err else problem.turn_noise.step
+    return replace(noise, common=common, way=way, step=step, tilt=tilt)
+
+
+def _likeliest_parts(
+    told: tuple[np.ndarray, np.ndarray],
+    total: np.ndarray,
+    travelled: np.ndarray,
+    before: np.ndarray,
+    priors: Sequence[_Prior],
+) -> np.ndarray:
+    """``(2,)`` logarithms of the variances per metre and per step, together, by Fisher scoring.
+
+    One by one, variances of which one can stand for the other would creep. Each segment's squares S and freedom n count
+    as those of its own variance V, −n/2 log V − S/(2 V), whose slope at the variances before is that of the restricted
+    likelihood.
+
+    Args:
+        told: squares and freedom of S segments, ``(S,)`` each.
+        total: ``(S,)`` m², their variances.
+        travelled: ``(S, 2)`` metres, and steps.
+        before: ``(2,)`` logarithms of the variances before.
+        priors: of the two.
+    """
+    squares, freedom = told
+    rest = np.maximum(total - travelled @ np.exp(before), 0.0)
+    median, spread = np.array(priors).T
+    believed, found = 1 / (4 * spread**2), before
+    for _ in range(_SCORING_STEPS):
+        parts = travelled * np.exp(found)
+        whole = rest + parts.sum(axis=1)
+        share = parts / whole[:, None]
+        slope = (squares / whole - freedom) @ share / 2 - believed * (found - median)
+        information = share.T @ (freedom[:, None] * share) / 2 + np.diag(believed)
+        change = np.clip(np.linalg.solve(information, slope), -1.0, 1.0)
+        found = found + change
+        if np.abs(change).max() < _SCORED:
+            break
+    return np.asarray(found)
 
 
 def log_noise_prior(problem: PoseProblem, noise: PoseNoise) -> float:
@@ -83,5 +132,6 @@ def priors_of(problem: PoseProblem, noise: PoseNoise) -> tuple[_Prior, ...]:
         (own, of_shifts.closure_spread),
         (2 * float(np.log(of_shifts.relative)), of_shifts.relative_spread),
         (float(np.log(noise.closure * of_shifts.common / (1 - of_shifts.common))), of_shifts.common_spread),
+        (2 * float(np.log(of_shifts.still * typical)), of_shifts.still_spread),
         (float(np.log(noise.turn)), TILT_SPREAD),
     )

@@ -14,13 +14,22 @@ import numpy as np
 from scipy.special import expit
 
 from rotavg_ros.solver.running.work import spend
-from rotavg_ros.solver.slam.poses.closures import GOOD, REPEATS, Places, Predictions, Scale, Told, log_from_behind
+from rotavg_ros.solver.slam.poses.closures import (
+    GOOD,
+    REPEATS,
+    TAILS,
+    Places,
+    Predictions,
+    Scale,
+    Told,
+    log_from_behind,
+)
 from rotavg_ros.solver.slam.poses.places import pulls
 from rotavg_ros.solver.slam.poses.places.classes import BY_ITSELF, WRONG, Said, log_sum
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 from rotavg_ros.solver.slam.poses.repeats.exactness import Errors, InTurn, shared_ways
 from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
-from rotavg_ros.solver.slam.poses.repeats.neighbours import Repeats, repeats_of, wrong_share
+from rotavg_ros.solver.slam.poses.repeats.neighbours import Repeats, repeats_of, tail_share, wrong_share
 
 _LOG_NOTHING = -1e6
 # Floor of probabilities; least distance of shares from zero and one.
@@ -40,12 +49,14 @@ class Judge:
         turns: k.
         priors: prior parameters of places.
         held: ``(C,)`` bool, labels of rotations, held fixed; None: judged by their densities.
+        counts_tails: whether the share of tails is estimated, or that of the prior.
     """
 
     told: Told
     turns: int
     priors: PlacePriors
-    held: np.ndarray | None = None
+    held: np.ndarray | None
+    counts_tails: bool
 
     def __call__(
         self, predictions: Predictions, maps: MapTurns, before: np.ndarray, scale: Scale, *, in_order: bool = False
@@ -72,7 +83,10 @@ class Judge:
         likely = shared_ways(repeats.elsewhere, np.ones(repeats.elsewhere.shape[1]), before[REPEATS], in_turn)
         anywhere = _Others(repeats.has_elsewhere, (likely * repeats.elsewhere).sum(axis=1))
         alike = self._log_repeats(_Others(repeats.has_alike, repeats.alike), repeats, alone, wrong, in_turn)
-        log_class += self._log_classes(share, alike, self._log_elsewhere(anywhere, alone, wrong, in_turn))
+        tails = np.full(len(known), self.priors.tails)
+        if self.counts_tails:
+            tails = tail_share(said.log_shift[TAILS] - said.log_shift[0], before, told, self.priors)
+        log_class += self._log_classes(share, tails, alike, self._log_elsewhere(anywhere, alone, wrong, in_turn))
         # Without a translation the place cannot be judged: a closure with a correct rotation is good.
         log_class[:, ~known] = _LOG_NOTHING
         log_class[0, ~known] = said.log_turn[0, ~known]
@@ -101,6 +115,7 @@ class Judge:
     def _log_classes(
         self,
         share: np.ndarray,
+        tails: np.ndarray,
         log_repeats: tuple[np.ndarray, np.ndarray],
         log_elsewhere: tuple[np.ndarray, np.ndarray],
     ) -> np.ndarray:
@@ -108,6 +123,7 @@ class Judge:
 
         Args:
             share: ``(C,)`` share of wrong places.
+            tails: ``(C,)`` share of tails among good ones.
             log_repeats: log probabilities that a wrong place does not repeat a neighbour's, and that it does.
             log_elsewhere: the same, for those that repeat no neighbour's, of repeating any other.
         """
@@ -116,7 +132,7 @@ class Judge:
         log_alone, log_repeat = log_repeats
         log_repeat = np.logaddexp(log_repeat, log_alone + log_elsewhere[1])
         by_itself = wrong + log_alone + log_elsewhere[0] + np.log1p(-priors.from_behind) - np.log(WRONG)
-        good = right + np.log1p(-priors.tails), right + np.log(priors.tails)
+        good = right + np.log1p(-tails), right + np.log(tails)
         return np.stack((*good, *[by_itself] * WRONG, wrong + log_repeat))
 
     def _log_false(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import expit, logit
 
 from rotavg_ros.solver.slam.poses.closures import GOOD, REPEATS, Told
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
@@ -23,6 +24,8 @@ from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
 
 # Least distance of shares from zero and one; and probability of being wrong below which a closure is no evidence.
 _SHARE = _LEAST_CHANCE = 0.01
+# Least share of tails, and steps by which it is found.
+_FEWEST, _TAIL_STEPS = 1e-3, 20
 
 
 @dataclass(frozen=True)
@@ -157,6 +160,26 @@ def wrong_share(before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarr
     overall = _overall(wrong, any_one, priors)
     in_run, of_run = np.bincount(told.run, wrong)[told.run] - wrong, np.bincount(told.run, any_one)[told.run] - any_one
     return np.asarray(np.clip((overall + in_run) / (1 + of_run), _SHARE, 1 - _SHARE))
+
+
+def tail_share(log_ratio: np.ndarray, before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarray:
+    """``(C,)`` probability that each, if good, is in the tails, by all others (Beta–Bernoulli).
+
+    By EM from the prior's share, anew for all densities: while variances are still too large nothing seems to be in the
+    tails, and a share that has once vanished would not come back.
+
+    Args:
+        log_ratio: ``(C,)`` nats, log density of each closure's shift in the tails minus that of other good ones.
+        before: ``(J + 1, C)`` probabilities of classes.
+        told: whose translations are known.
+        priors: of places.
+    """
+    good = before[:GOOD].sum(axis=0) * told.is_known
+    counted, share = good.sum() + priors.counted, priors.tails
+    for _ in range(_TAIL_STEPS):
+        tails = good * expit(log_ratio + logit(share))
+        share = (priors.tails * priors.counted + tails.sum()) / counted
+    return np.asarray(np.clip((share * counted - tails) / (counted - good), _FEWEST, 1 - _SHARE))
 
 
 def log_places(before: np.ndarray, told: Told, priors: PlacePriors) -> float:

@@ -37,7 +37,7 @@ class Join(NamedTuple):
 
 def joined_otherwise(rival: Rival) -> Rival:
     """The same labelling with chains placed by other closures, one after the other, as long as −log p falls."""
-    if "believed-runs" in rival.mode.problem.without:
+    if "joins" in rival.mode.problem.without:
         return rival
     tried: set[bytes] = set()
     for _ in range(_MAX_GROUPS):

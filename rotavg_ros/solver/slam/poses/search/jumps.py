@@ -14,8 +14,8 @@ import numpy as np
 
 from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.poses.closures import given_turn
+from rotavg_ros.solver.slam.poses.em.estimate import judge_of
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
-from rotavg_ros.solver.slam.poses.places.judge import Judge
 from rotavg_ros.solver.slam.poses.repeats.neighbours import log_places
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import PoseMode
@@ -189,7 +189,7 @@ class _Witnesses:
         is_wrong = (places.right < _WRONG) & can_tell & (told.label == 0)
         # A jump that removes a wrong closure's offset gives it at least the density log_here; a right closure that is
         # displaced loses its right place.
-        judge = Judge(told, k, problem.priors)
+        judge = judge_of(problem)
         # In order of detection, since closures that agree would otherwise support each other's wrong places.
         held = judge(solved.predictions, solved.maps, places.chance, solved.scale, in_order=True).log_density
         freed, lost = log_here - held, -np.log(np.maximum(1 - places.right, _LEAST))

@@ -122,7 +122,8 @@ def _jumping(rival: Rival) -> list[Rival]:
     begun = [rival]
     # Closures that pull across a jump bend the map until right ones seem wrong, or odometry's variance grows until
     # nothing does. So jumps are also looked for before closures pull, and before variances grow.
-    has_grown = rival.pose.state.noise.way > before.turn_noise.way
+    typical = np.array([before.typical, 1.0])
+    has_grown = rival.pose.state.noise.of_odometry(typical) > before.turn_noise.of_odometry(typical)
     for solves in (1, HELD) if has_grown else (1,):
         jumped = _with_jumps(estimate_poses(before, ending=Ending(held_for=solves)))
         if jumped.problem is not before and not any(jumped.jumps_like(other.pose) for other in begun):

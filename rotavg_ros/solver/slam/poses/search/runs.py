@@ -19,8 +19,8 @@ from scipy.special import chdtrc
 
 from rotavg_ros.solver.algebra.products import inverse_of
 from rotavg_ros.solver.running.work import rest, stop_if_abandoned
+from rotavg_ros.solver.slam.poses.em.estimate import judge_of
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
-from rotavg_ros.solver.slam.poses.places.judge import Judge
 from rotavg_ros.solver.slam.poses.repeats.neighbours import log_all_right
 from rotavg_ros.solver.slam.poses.search.settling import LEAST_GAIN, SLACK, Rival, moved
 from rotavg_ros.solver.slam.poses.solved import PoseMode
@@ -77,7 +77,7 @@ def runs_to_believe(pose: PoseMode) -> list[tuple[float, np.ndarray]]:
     runs = _nearest(pose, could)
     if not runs:
         return []
-    judge = Judge(told, pose.problem.turns, pose.problem.priors)
+    judge = judge_of(pose.problem)
     in_order = judge(pose.solved.predictions, pose.solved.maps, places.chance, pose.solved.scale, in_order=True)
     found = [_Run.of(pose, members, in_order.log_density[members]) for members in runs]
     return sorted(((run.gained, run.members) for run in found if run is not None), key=lambda each: -each[0])

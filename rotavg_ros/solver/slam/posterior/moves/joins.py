@@ -28,6 +28,9 @@ from rotavg_ros.solver.slam.posterior.moves.slips import (
 )
 from rotavg_ros.solver.slam.posterior.state import State
 
+# Maximum number of false closures of which it is counted how many agree with each.
+_MAX_TRIED = 256
+
 
 def propose_joins(mode: Mode) -> Iterator[Proposal]:
     """Proposes to turn a chain, and all that good closures hang on it, as a group of false closures says."""
@@ -46,14 +49,12 @@ def propose_joins(mode: Mode) -> Iterator[Proposal]:
     for _ in range(problem.limits.slips):
         if not is_left.any():
             break
-        groups = []
-        for each in np.flatnonzero(is_left):
-            difference = 2 * np.arccos(np.minimum(np.abs(turned[:, each] @ turned), 1.0))
-            square = AGREE**2 * problem.components * (variance + variance[each]) + AGREE_ANGLE**2
-            groups.append(joins & (low == low[each]) & (high == high[each]) & (difference**2 < square))
-        size = [int((group & is_left).sum()) for group in groups]
-        best = int(np.argmax(size))
-        seed, agrees = int(np.flatnonzero(is_left)[best]), groups[best]
+        tried = np.flatnonzero(is_left)[:_MAX_TRIED, None]
+        difference = 2 * np.arccos(np.minimum(np.abs(turned[:, tried[:, 0]].T @ turned), 1.0))
+        square = AGREE**2 * problem.components * (variance + variance[tried]) + AGREE_ANGLE**2
+        groups = joins & (low == low[tried]) & (high == high[tried]) & (difference**2 < square)
+        best = int((groups & is_left).sum(axis=1).argmax())
+        seed, agrees = int(tried[best, 0]), groups[best]
         is_left &= ~agrees
         held = joins & ~mode.is_false & ~((low == low[seed]) & (high == high[seed]) & ~agrees)
         for chains in _sides(int(number.max()) + 1, ends, ends[:, held], (int(low[seed]), int(high[seed]))):
