@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,7 +39,7 @@ def typical_length(way: NDArray[np.float64], steps: NDArray[np.float64], is_odom
         is_odometry: ``(M,)`` bool, the edges that count.
     """
     length = np.sort(way[is_odometry] / steps[is_odometry])
-    usual = length[: len(length) - int(_JUMPING * len(length))]
+    usual = length[: len(length) - math.ceil(_JUMPING * len(length))]
     passed = np.cumsum(usual)
     if len(usual) == 0 or not passed[-1] > 0:
         moving = length[length > 0]

@@ -23,6 +23,11 @@ def test_neither_standing_still_nor_jumps_change_it(standing: int, jump: float) 
     assert typical(1000 * length) == pytest.approx(1000 * typical(length))
 
 
+@pytest.mark.parametrize("steps", [3, 60, 98])
+def test_one_jump_in_a_short_run_does_not_change_it(steps: int) -> None:
+    assert typical(np.append(np.ones(steps), 1e6)) == 1.0
+
+
 def test_where_few_or_no_steps_move() -> None:
     assert typical(np.zeros(5)) == typical(np.zeros(0)) == 1.0
     assert typical(np.array([0.0, 0.0, 0.3])) == 0.3

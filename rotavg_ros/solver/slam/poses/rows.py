@@ -30,7 +30,7 @@ from rotavg_ros.view_graph import ViewGraph
 
 # Motion counts as planar if shifts off the plane are below this share of the longest.
 _PLANAR = 1e-6
-# Least error of a segment without motion, as a share of a typical step.
+# Least length of a step that jumps, as a share of a typical step; steps that err by the way alone err by that of this.
 _LEAST_LENGTH = 1e-3
 # The share of an error that is not shared; the system stays solvable.
 _NONE = 1e-6
@@ -465,6 +465,6 @@ class PoseProblem:
 
     def root_weight(self, rotation_weight: np.ndarray, state: PoseState) -> np.ndarray:
         """``(d,)`` weight that ties roots down."""
-        shift = max(1 / (state.noise.way * self.typical * _LEAST_LENGTH), 1 / state.noise.closure)
+        shift = max(1 / state.noise.step, 1 / state.noise.closure)
         tied = np.full(self.turns, float(rotation_weight.max())), np.full(self.shifts, shift)
         return _GROUNDING * np.concatenate(tied)

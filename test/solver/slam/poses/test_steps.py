@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros.metrics.positions import position_errors
 from rotavg_ros.solver import solve
 from rotavg_ros.solver.slam.poses.closures import GOOD, TAILS
+from rotavg_ros.solver.slam.poses.em.noise import _likeliest_parts
 from rotavg_ros.view_graph import ViewGraph
 
 from .test_poses import pose_mode
@@ -61,6 +62,28 @@ def test_what_a_step_errs_by_is_found() -> None:
         assert by_length.step < 0.05 * SHIFT**2
         mean_step = 5 * 2 * np.pi * 20 / 320
         assert by_length.way * mean_step == pytest.approx(SHIFT**2, rel=0.35)
+
+
+@torch.no_grad()
+def test_without_a_part_of_each_step_all_of_it_is_in_proportion_to_the_way() -> None:
+    graph, _ = laps(0)
+    pose = pose_mode(graph, without={"step-errors"})
+    solved, segments = pose.solved, slice(pose.problem.drawn.num_segments)
+    k = pose.problem.turns
+    freedom = np.trace(solved.factor.redundancy[segments, k:, k:], axis1=1, axis2=2)
+    assert (solved.left[segments, k:] ** 2).sum() / freedom.sum() == pytest.approx(1.0, abs=0.1)
+
+
+@torch.no_grad()
+def test_squares_far_above_their_prior_end_the_steps() -> None:
+    """A prior that holds a variance far below its squares: the curvature there is that of the squares."""
+    ones, priors = np.ones(20), [(0.0, 0.7)]
+
+    def found(start: float) -> float:
+        told = 400 / 20 * ones, 2 / 20 * ones
+        return float(_likeliest_parts(told, np.exp(start) * ones, ones[:, None], np.array([start]), priors)[0])
+
+    assert found(2.0) == pytest.approx(found(4.0), abs=1e-2)
 
 
 def test_positions_are_better_by_it() -> None:

@@ -60,9 +60,9 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     logarithms[_ALONE] = np.log([likeliest(told, number) for number, told in zip(_ALONE, found, strict=True)])
     total = np.trace(solved.covariance[segments], axis1=1, axis2=2) / problem.shifts
     told = (pulled**2).sum(axis=(1, 2)) * total**2, np.trace(left_over, axis1=1, axis2=2) * total
-    logarithms[_OF_SHIFTS] = _likeliest_parts(
-        told, total, solved.way.travelled[segments], noise.logarithms[_OF_SHIFTS], [priors[each] for each in _OF_SHIFTS]
-    )
+    free = _OF_SHIFTS[: 2 if problem.steps_err else 1]
+    travelled = solved.way.travelled[segments, : len(free)]
+    logarithms[free] = _likeliest_parts(told, total, travelled, logarithms[free], [priors[each] for each in free])
     noise = PoseNoise.of(logarithms)
     if problem.drift_axis is None or noise.tilt > noise.turn:
         # A larger variance of tilts is not allowed: it would make room for false closures.
@@ -73,9 +73,8 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     farthest = problem.priors.largest_step**2 * problem.typical
     common = min(noise.common, most / (1 - most) * noise.closure)
     tilt = max(noise.tilt, LEAST_TILT**2 * noise.turn)
-    way, step = min(noise.way, farthest), min(noise.step, farthest * problem.typical)
-    step = step if problem.steps_err else problem.turn_noise.step
-    return replace(noise, common=common, way=way, step=step, tilt=tilt)
+    within = min(1.0, farthest * problem.typical / float(noise.of_odometry(np.array([problem.typical, 1.0]))))
+    return replace(noise, common=common, way=within * noise.way, step=within * noise.step, tilt=tilt)
 
 
 def _likeliest_parts(
@@ -85,7 +84,7 @@ def _likeliest_parts(
     before: np.ndarray,
     priors: Sequence[_Prior],
 ) -> np.ndarray:
-    """``(2,)`` logarithms of the variances per metre and per step, together, by Fisher scoring.
+    """``(n,)`` logarithms of the variances per metre, and per step unless that is fixed, together, by Fisher scoring.
 
     One by one, variances of which one can stand for the other would creep. Each segment's squares S and freedom n count
     as those of its own variance V, −n/2 log V − S/(2 V), whose slope at the variances before is that of the restricted
@@ -94,9 +93,9 @@ def _likeliest_parts(
     Args:
         told: squares and freedom of S segments, ``(S,)`` each.
         total: ``(S,)`` m², their variances.
-        travelled: ``(S, 2)`` metres, and steps.
-        before: ``(2,)`` logarithms of the variances before.
-        priors: of the two.
+        travelled: ``(S, n)`` metres, and steps.
+        before: ``(n,)`` logarithms of the variances before.
+        priors: of these.
     """
     squares, freedom = told
     rest = np.maximum(total - travelled @ np.exp(before), 0.0)
@@ -107,7 +106,9 @@ def _likeliest_parts(
         whole = rest + parts.sum(axis=1)
         share = parts / whole[:, None]
         slope = (squares / whole - freedom) @ share / 2 - believed * (found - median)
-        information = share.T @ (freedom[:, None] * share) / 2 + np.diag(believed)
+        # Where squares are more than what is expected the curvature is, too, and a step would swing to and fro.
+        counted = np.maximum(freedom, squares / whole)
+        information = share.T @ (counted[:, None] * share) / 2 + np.diag(believed)
         change = np.clip(np.linalg.solve(information, slope), -1.0, 1.0)
         found = found + change
         if np.abs(change).max() < _SCORED:

@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rotavg_ros.solver.running.work import rest, stop_if_abandoned
+from rotavg_ros.solver.slam.graph.evenly import evenly
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.search.settling import LEAST_GAIN, Rival, moved
 from rotavg_ros.solver.slam.poses.solved import PoseMode
@@ -19,8 +21,8 @@ from rotavg_ros.solver.slam.poses.solved import PoseMode
 _WRONG = 0.5
 # Two closures agree about where a chain lies if they differ by less than this many standard deviations.
 _ALIKE = 3.0
-# Maximum number of groups that are tried, those of most closures first, and of joining closures that are compared.
-_MAX_GROUPS, _MAX_COMPARED = 4, 1000
+# Maximum number of rounds; of joins that are tried in each, those of most closures first; and of closures compared.
+_MAX_ROUNDS, _MAX_JOINS, _MAX_COMPARED = 4, 8, 1000
 
 
 class Join(NamedTuple):
@@ -40,8 +42,8 @@ def joined_otherwise(rival: Rival) -> Rival:
     if "joins" in rival.mode.problem.without:
         return rival
     tried: set[bytes] = set()
-    for _ in range(_MAX_GROUPS):
-        for join in other_joins(rival.pose)[: 2 * _MAX_GROUPS]:
+    for _ in range(_MAX_ROUNDS):
+        for join in other_joins(rival.pose):
             key = join.believed.tobytes() + b"|" + join.doubted.tobytes()
             if key in tried:
                 continue
@@ -65,7 +67,8 @@ def other_joins(pose: PoseMode) -> list[Join]:
     closure, drawn, k = problem.mode.problem.closure, problem.drawn, problem.turns
     chain = np.stack((drawn.chain[drawn.source[closure]], drawn.chain[drawn.target[closure]]), axis=1)
     joins = np.flatnonzero((chain[:, 0] != chain[:, 1]) & told.is_known & (told.label == 0))
-    could = joins[(places.right[joins] < _WRONG) & (places.rotation_good[joins] > _WRONG)][:_MAX_COMPARED]
+    could = joins[(places.right[joins] < _WRONG) & (places.rotation_good[joins] > _WRONG)]
+    could = evenly(could[np.argsort(told.detected[could])], _MAX_COMPARED)
     if len(could) == 0:
         return []
     # By how much the chain of the higher number would move, and with which variance, lever arms included.
@@ -78,7 +81,9 @@ def other_joins(pose: PoseMode) -> list[Join]:
     alike = (square < _ALIKE**2 * shift.shape[1]) & (pair[:, None] == pair[None]).all(axis=2)
     found: list[Join] = []
     is_left = np.ones(len(could), dtype=bool)
-    while is_left.any():
+    while is_left.any() and len(found) < _MAX_JOINS:
+        stop_if_abandoned()
+        rest()
         seed = int(np.argmax(np.where(is_left, (alike & is_left).sum(axis=1), -1)))
         members = alike[seed] & is_left
         is_left &= ~members

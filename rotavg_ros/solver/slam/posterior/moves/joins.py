@@ -15,6 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.slam.graph.evenly import evenly
 from rotavg_ros.solver.slam.posterior.em import settle
 from rotavg_ros.solver.slam.posterior.left_out import rough_cost
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
@@ -49,7 +50,8 @@ def propose_joins(mode: Mode) -> Iterator[Proposal]:
     for _ in range(problem.limits.slips):
         if not is_left.any():
             break
-        tried = np.flatnonzero(is_left)[:_MAX_TRIED, None]
+        left = np.flatnonzero(is_left)
+        tried = evenly(left[np.argsort(problem.detected[left])], _MAX_TRIED)[:, None]
         difference = 2 * np.arccos(np.minimum(np.abs(turned[:, tried[:, 0]].T @ turned), 1.0))
         square = AGREE**2 * problem.components * (variance + variance[tried]) + AGREE_ANGLE**2
         groups = joins & (low == low[tried]) & (high == high[tried]) & (difference**2 < square)
