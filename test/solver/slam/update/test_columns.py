@@ -31,7 +31,7 @@ def _linear(information: np.ndarray, is_half: bool) -> Linear:
         return (np.linalg.solve(root.T, half) if is_half else half).reshape(_BLOCKS, _SIZE, -1)
 
     nothing, nowhere = np.zeros((2, _BLOCKS)), np.arange(_BLOCKS)
-    noise, axes = PoseNoise(*np.ones(7)), np.eye(3)
+    noise, axes = PoseNoise(*np.ones(8)), np.eye(3)
     return Linear(
         0,
         nowhere,
