@@ -338,6 +338,7 @@ STRUCTURAL = {
     "publishing/notes": {"_FAR_SLIP", "_WORTH_A_WORD"},
     "moves/flips": {"_PART", "_DECIDED", "_HOPE", "_LEAST_GAIN"},
     "mode": {"OTHER_NOISE", "_SAME", "_MAX_DENSE"},
+    "moves/joins": {"_MAX_TRIED"},
     "moves/jumps": {"_MAX_ROUNDS", "_MAX_CANDIDATES", "_MIN_GAIN", "_MIN_CARRIED"},
     "moves/noise": {
         "_GRIDS",

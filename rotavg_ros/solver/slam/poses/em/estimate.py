@@ -72,6 +72,7 @@ def estimate_poses(
     change, sorted_by = np.zeros(len(state.noise.logarithms)), np.zeros_like(places.chance)
     pace = Pace.of(len(is_good))
     number, held, most = 0, *((HELD, MAX_SOLVES) if start is None else (0, start.solves))
+    counts_tails, judge = judge.counts_tails, replace(judge, counts_tails=judge.counts_tails and start is not None)
     while True:
         solved = _solve(problem, state, places, judge)
         if number == 0:
@@ -88,7 +89,10 @@ def estimate_poses(
         if number == most or ending.is_early(number, after, is_at_rest=is_at_rest):
             break
         if number > held and is_at_rest and noise_rests(noise - state.noise.logarithms):
-            break
+            if judge.counts_tails == counts_tails:
+                break
+            # Only now: while variances are too small most closures seem to be in the tails, which keeps them small.
+            judge = replace(judge, counts_tails=True)
         is_held = ending.held_for is not None or number <= held
         state, change = with_noise(solved.state, noise, change, is_held=is_held)
         places = following(after, problem, solved.state.noise, state.noise)

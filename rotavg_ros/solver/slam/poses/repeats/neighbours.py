@@ -24,8 +24,8 @@ from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
 
 # Least distance of shares from zero and one; and probability of being wrong below which a closure is no evidence.
 _SHARE = _LEAST_CHANCE = 0.01
-# Least share of tails, and steps by which it is found.
-_FEWEST, _TAIL_STEPS = 1e-3, 20
+# Least and largest share of tails, and steps by which it is found.
+_FEWEST, _MOST, _TAIL_STEPS = 1e-3, 0.5, 20
 
 
 @dataclass(frozen=True)
@@ -165,8 +165,7 @@ def wrong_share(before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarr
 def tail_share(log_ratio: np.ndarray, before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarray:
     """``(C,)`` probability that each, if good, is in the tails, by all others (Beta–Bernoulli).
 
-    By EM from the prior's share, anew for all densities: while variances are still too large nothing seems to be in the
-    tails, and a share that has once vanished would not come back.
+    By EM from the prior's share, anew for all densities, so that a share that has once vanished comes back.
 
     Args:
         log_ratio: ``(C,)`` nats, log density of each closure's shift in the tails minus that of other good ones.
@@ -179,7 +178,8 @@ def tail_share(log_ratio: np.ndarray, before: np.ndarray, told: Told, priors: Pl
     for _ in range(_TAIL_STEPS):
         tails = good * expit(log_ratio + logit(share))
         share = (priors.tails * priors.counted + tails.sum()) / counted
-    return np.asarray(np.clip((share * counted - tails) / (counted - good), _FEWEST, 1 - _SHARE))
+    others = (share * counted - tails) / (counted - good)
+    return np.asarray(np.clip(others, _FEWEST, _MOST))
 
 
 def log_places(before: np.ndarray, told: Told, priors: PlacePriors) -> float:
