@@ -28,7 +28,7 @@ class PlacePriors:
         common: median share of a closure's variance that it has in common with those near it.
         common_spread: standard deviation of the logarithm of the shared over the unshared variance.
         most_common: largest common share.
-        tails: share of good closures whose translation errs by far more than others'.
+        tails: share of good closures whose translation errs by far more than others'; fewer where fewer show.
         tail_ratio: factor of the variance of these.
         turned_deg: standard deviation of the turn between the views of two places that look alike.
         from_behind: share of places that look alike when seen from the other side, half a turn off.

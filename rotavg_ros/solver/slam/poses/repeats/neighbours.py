@@ -24,8 +24,8 @@ from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
 
 # Least distance of shares from zero and one; and probability of being wrong below which a closure is no evidence.
 _SHARE = _LEAST_CHANCE = 0.01
-# Least and largest share of tails, and steps by which it is found.
-_FEWEST, _MOST, _TAIL_STEPS = 1e-3, 0.5, 20
+# Least share of tails, and steps by which it is found.
+_FEWEST, _TAIL_STEPS = 1e-3, 20
 
 
 @dataclass(frozen=True)
@@ -163,9 +163,10 @@ def wrong_share(before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarr
 
 
 def tail_share(log_ratio: np.ndarray, before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarray:
-    """``(C,)`` probability that each, if good, is in the tails, by all others (Beta–Bernoulli).
+    """``(C,)`` probability that each, if good, is in the tails, by all others (Beta–Bernoulli); at most the prior's.
 
-    By EM from the prior's share, anew for all densities, so that a share that has once vanished comes back.
+    By EM from that share, anew for all densities, so that a share that has once vanished comes back. If most could be
+    in the tails, these could be taken for what is usual, and a smaller variance for what is rare.
 
     Args:
         log_ratio: ``(C,)`` nats, log density of each closure's shift in the tails minus that of other good ones.
@@ -179,7 +180,7 @@ def tail_share(log_ratio: np.ndarray, before: np.ndarray, told: Told, priors: Pl
         tails = good * expit(log_ratio + logit(share))
         share = (priors.tails * priors.counted + tails.sum()) / counted
     others = (share * counted - tails) / (counted - good)
-    return np.asarray(np.clip(others, _FEWEST, _MOST))
+    return np.asarray(np.clip(others, _FEWEST, priors.tails))
 
 
 def log_places(before: np.ndarray, told: Told, priors: PlacePriors) -> float:
