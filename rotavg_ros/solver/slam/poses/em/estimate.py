@@ -175,7 +175,7 @@ def likeliest_level(usual: PoseMode) -> Level:
         usual: the same labelling, begun with the prior variances.
     """
     problem, told = usual.problem, [usual.first]
-    judge = judge_of(problem)
+    judge = replace(judge_of(problem), counts_tails=False)  # as in the first solve of the usual beginning
     for level in _LEVELS[1:]:
         state = along_odometry(problem, level)
         told.append(_log_likely(problem, _solve(problem, state, _nothing_known(problem, state, judge), judge)))
