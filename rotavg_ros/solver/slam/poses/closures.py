@@ -66,6 +66,21 @@ class Predictions:
         root = np.sqrt(share)
         return Predictions(share * self.mean, root[:, :, None] * self.covariance * root[:, None, :])
 
+    def square_length(self, stated: np.ndarray, own: np.ndarray) -> np.ndarray:
+        """``(C,)`` m², expected squared lengths of closures, given what each states and the predictions by all else.
+
+        The length that one states will not do: where its error is larger than its length, it would explain itself.
+
+        Args:
+            stated: ``(C, m)`` metres, stated shifts in the axes of the predictions.
+            own: ``(C,)`` m² per component, variance of each as a good closure.
+        """
+        turns = self.mean.shape[1] - stated.shape[1]
+        spread = np.trace(self.covariance[:, turns:, turns:], axis1=1, axis2=2) / stated.shape[1]
+        share = own / (own + spread)
+        between = stated - share[:, None] * self.mean[:, turns:]
+        return np.asarray((between**2).sum(axis=1) + stated.shape[1] * share * spread)
+
     def tell(self, turns: int, extent: float) -> np.ndarray:
         """``(C,)`` bool, whether turns and shifts are predicted with less than half the uninformed variance.
 
@@ -173,6 +188,7 @@ class Scale:
         floor_share: ``(C,)`` share of the own part that does not grow with its length.
         extent: variance of the distance between two places of the map.
         anywhere: ``(C,)`` variance of a wrong closure: to any place of the map, or as far as it states.
+        square_length: ``(C,)`` m², expected squared length of each, not per component.
     """
 
     good: np.ndarray
@@ -180,6 +196,7 @@ class Scale:
     floor_share: np.ndarray
     extent: float
     anywhere: np.ndarray
+    square_length: np.ndarray
 
     @cached_property
     def closure(self) -> float:

@@ -294,14 +294,20 @@ class PoseProblem:
         """``(C,)`` the view-graph's edges of the closures."""
         return np.asarray(self.drawn.view_graph_edge[self.mode.problem.closure - self.drawn.num_segments])
 
-    def closure_variance(self, noise: PoseNoise) -> np.ndarray:
-        """``(C,)`` m² per component, variance of good closures' translations."""
-        return noise.of_closures((self.lengths[self.closures] ** 2).sum(axis=1))
+    @cached_property
+    def stated_square(self) -> np.ndarray:
+        """``(C,)`` m², squared lengths that closures state."""
+        return np.asarray((self.lengths[self.closures] ** 2).sum(axis=1))
 
-    def own_variance(self, noise: PoseNoise) -> np.ndarray:
-        """``(C,)`` m², part of that which each closure does not share with its run."""
+    def own_variance(self, noise: PoseNoise, square_length: np.ndarray) -> np.ndarray:
+        """``(C,)`` m² per component, the part of good closures' variance that they do not share with their runs.
+
+        Args:
+            noise: all variances.
+            square_length: ``(C,)`` m², squared lengths of closures.
+        """
         is_shared = self.run[self.mode.problem.closure] >= 0
-        return np.asarray(self.closure_variance(noise) - is_shared * noise.common)
+        return np.asarray(noise.of_closures(square_length) - is_shared * noise.common)
 
     @cached_property
     def told(self) -> Told:
@@ -411,7 +417,7 @@ class PoseProblem:
         variance[:num_segments] += self.jumps
         # Rejected odometry beside the chain connects nothing else, so it does not pull.
         variance[num_segments:] = np.where(slipped, variance / NOTHING, variance)[num_segments:]
-        variance[self.mode.problem.closure] = self.own_variance(noise)
+        variance[self.mode.problem.closure] = self.own_variance(noise, self.stated_square)
         covariance = variance[:, None, None] * unit
         bending = self.bridge_variance(noise)[:, :, None, None] * self.bent(way)
         covariance[: drawn.num_segments] += bending.sum(axis=0)

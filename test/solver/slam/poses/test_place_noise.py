@@ -127,7 +127,7 @@ def test_before_any_solve_as_many_places_may_be_wrong_as_is_believed_beforehand(
     problem = pose_mode(graph_of(simulated(1))).problem
     count = len(problem.closures)
     judge = judge_of(problem)
-    scale = Scale(np.ones(count), np.ones(count), np.ones(count), 100.0, np.full(count, 100.0))
+    scale = Scale(np.ones(count), np.ones(count), np.ones(count), 100.0, np.full(count, 100.0), np.zeros(count))
     places = judge.nothing_known(np.ones(count, dtype=bool), np.zeros(count), scale)
     wrong = problem.priors.wrong_place / problem.priors.counted
     np.testing.assert_allclose(wrong_share(places.chance, problem.told, problem.priors), wrong)

@@ -96,9 +96,18 @@ class Pace:
         return replace(places, weight=weight, rotation_weight=rotation_weight), Pace(share, change)
 
 
-def following(places: Places, problem: PoseProblem, before: PoseNoise, after: PoseNoise) -> Places:
-    """Rescales weights to new variances, keeping their ratio to the weight of a good closure."""
-    shift = problem.own_variance(before) / problem.own_variance(after)
+def following(
+    places: Places, problem: PoseProblem, square_length: np.ndarray, before: PoseNoise, after: PoseNoise
+) -> Places:
+    """Rescales weights to new variances, keeping their ratio to the weight of a good closure.
+
+    Args:
+        places: with weights for the variances before.
+        problem: the graph.
+        square_length: ``(C,)`` m², squared lengths of closures.
+        before, after: all variances.
+    """
+    shift = problem.own_variance(before, square_length) / problem.own_variance(after, square_length)
     turn = before.closure_turn / after.closure_turn
     return replace(places, weight=places.weight * shift, rotation_weight=places.rotation_weight * turn)
 

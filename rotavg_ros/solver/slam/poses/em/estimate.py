@@ -95,7 +95,7 @@ def estimate_poses(
             judge = replace(judge, counts_tails=True)
         is_held = ending.held_for is not None or number <= held
         state, change = with_noise(solved.state, noise, change, is_held=is_held)
-        places = following(after, problem, solved.state.noise, state.noise)
+        places = following(after, problem, solved.scale.square_length, solved.state.noise, state.noise)
     if not hold:
         return PoseMode(problem, solved, math.nan, first)
     used = problem.closure_turns(solved.state.noise)
@@ -139,14 +139,19 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     left = whitened - explained
     # xᵀ H x of the step x; for x ~ N(0, H⁻¹) its expectation is the number of unknowns.
     moved_by = math.sqrt(float((explained**2).sum()) / max(step.size, 1))
-    scale = _scale(problem, state)
+    extent = _extent(problem, state)
     # Variance of a closure's shift if neither the place of its source nor its orientation is known.
-    anywhere = scale.extent + (problem.lengths[problem.closures] ** 2).sum(axis=1)
+    anywhere = extent + problem.stated_square
     spend(_ROW * len(jacobian))
     predictions = _left_out(factor, root, left, closure).within(k, ANYHOW, anywhere)
+    stated = state.noise.of_closures(problem.stated_square)
+    square_length = problem.stated_square
+    if "expected-lengths" not in problem.mode.problem.without:
+        square_length = predictions.square_length(way.displacement[closure] @ shifts, stated)
+    scale = _scale(problem, state, square_length)
     judge = replace(judge, told=replace(judge.told, rotation_variance=turn_variances[closure, 0]))
     spend(_ROW * len(jacobian))
-    maps = MapTurns.of(problem, state.position, predictions, scale.good)
+    maps = MapTurns.of(problem, state.position, predictions, stated)
     spend(_ROW * len(jacobian))
     judged = judge(predictions, maps, places.chance, scale)
     return Solved(
@@ -191,16 +196,22 @@ def _nothing_known(problem: PoseProblem, state: PoseState, judge: Judge) -> Plac
     closure = problem.mode.problem.closure
     residual = problem.residuals(state, problem.displacements(problem.orientations(state)))
     square = (residual[closure, problem.turns :] ** 2).sum(axis=1)
-    return judge.nothing_known(problem.mode.state.is_good[closure], square, _scale(problem, state))
+    return judge.nothing_known(problem.mode.state.is_good[closure], square, _scale(problem, state, problem.stated_square))
 
 
-def _scale(problem: PoseProblem, state: PoseState) -> Scale:
+def _extent(problem: PoseProblem, state: PoseState) -> float:
+    """m² per component, variance of the distance between two places of the map."""
     spread = float(np.var(state.position @ problem.bases[1], axis=0).mean())
-    good, own = problem.closure_variance(state.noise), problem.own_variance(state.noise)
-    extent = 2 * spread + (_LEAST_EXTENT * problem.typical) ** 2
+    return 2 * spread + (_LEAST_EXTENT * problem.typical) ** 2
+
+
+def _scale(problem: PoseProblem, state: PoseState, square_length: np.ndarray) -> Scale:
+    """Scales for closures between places that are ``square_length (C,)`` m² apart."""
+    extent, own = _extent(problem, state), problem.own_variance(state.noise, square_length)
     # A closure may state an absurd length, for which Gaussians of the map's extent would not distinguish its classes.
-    stated = (problem.lengths[problem.closures] ** 2).sum(axis=1) / problem.shifts
-    return Scale(good, own, state.noise.closure / own, extent, np.maximum(extent, stated))
+    anywhere = np.maximum(extent, problem.stated_square / problem.shifts)
+    good = state.noise.of_closures(square_length)
+    return Scale(good, own, state.noise.closure / own, extent, anywhere, square_length)
 
 
 def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.ndarray) -> Predictions:

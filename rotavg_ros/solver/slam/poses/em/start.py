@@ -59,7 +59,7 @@ class PoseStart:
         chance, weight, rotation = places.chance.copy(), places.weight.copy(), places.rotation_weight.copy()
         chance[:, closures] = 0.0
         chance[0, closures] = 1.0
-        weight[closures] = 1 / problem.own_variance(noise)[closures]
+        weight[closures] = 1 / pose.solved.scale.own[closures]
         rotation[closures] = 1 / problem.closure_turns(noise)[closures]
         begun = replace(places, chance=chance, weight=weight, rotation_weight=rotation)
         return replace(cls.at(pose), places=begun)
