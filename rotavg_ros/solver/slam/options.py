@@ -36,6 +36,7 @@ SWITCHES: dict[str, str] = {
     "body-axes": "where no vertical is known, turns err equally about all axes of the body",
     "step-errors": "odometry's translations err in proportion to the way, not by a part of each step as well",
     "expected-lengths": "a closure's translation errs with the length that it states, not with the expected one",
+    "shift-axes": "closures' translations err alike along all axes of the body",
     "counted-tails": "as many good closures have translations in the tails as the prior says",
     "translations": "closures are judged by their rotations alone",
     "jumps": "odometry's position does not jump while its heading stays right",

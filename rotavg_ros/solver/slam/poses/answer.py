@@ -113,7 +113,8 @@ def _precision(pose: PoseMode) -> np.ndarray:
     if problem.jump is not None:
         shift += problem.jump
     turn[edges] = mean_square[closure] / pose.solved.rotation_weight[closure, 0]
-    shift[edges] = 1 / pose.solved.closure_weight
+    back = pose.solved.closure_back
+    shift[edges] = np.einsum("cij,cij->c", back, back) / problem.shifts
     known = np.isfinite(problem.translation).all(axis=1)
     return np.asarray(np.stack((1 / turn, known / shift), axis=1))
 

@@ -10,6 +10,7 @@ from rotavg_ros.solver.algebra.small_matrices import eigh, inverse_root
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.noise.repeats import Near, places_near
+from rotavg_ros.solver.slam.poses.even_shifts import EvenShifts
 from rotavg_ros.solver.slam.posterior.densities import log_half_turn
 
 # Classes of good closures come first.
@@ -81,6 +82,15 @@ class Predictions:
         between = stated - share[:, None] * self.mean[:, turns:]
         return np.asarray((between**2).sum(axis=1) + stated.shape[1] * share * spread)
 
+    def even(self, shifts: np.ndarray) -> Predictions:
+        """The predictions of even shifts, given the maps ``(C, m, m)`` from shifts to these."""
+        turns = self.mean.shape[1] - shifts.shape[1]
+        mean, covariance = self.mean.copy(), self.covariance.copy()
+        mean[:, turns:] = np.matmul(shifts, mean[:, turns:, None])[:, :, 0]
+        covariance[:, turns:] = np.matmul(shifts, covariance[:, turns:])
+        covariance[:, :, turns:] = np.matmul(covariance[:, :, turns:], shifts.transpose(0, 2, 1))
+        return Predictions(mean, covariance)
+
     def tell(self, turns: int, extent: float) -> np.ndarray:
         """``(C,)`` bool, whether turns and shifts are predicted with less than half the uninformed variance.
 
@@ -147,6 +157,8 @@ class Places:
         log_density: ``(C,)`` nats, of each closure, summed over its classes.
         error, error_variance: ``(J + 1, C)`` m and m² per component, of ε in each class (the last: a false rotation):
             length of its mean, and variance.
+        even: ``(C, m, m)`` from shifts to the even ones that ``weight`` weighs.
+        along_body: ``(2, m, m)`` squares and freedom of good closures' even shifts in the body's axes.
     """
 
     chance: np.ndarray
@@ -157,6 +169,13 @@ class Places:
     log_density: np.ndarray
     error: np.ndarray
     error_variance: np.ndarray
+    even: np.ndarray
+    along_body: np.ndarray
+
+    @property
+    def closure_root(self) -> np.ndarray:
+        """``(C, m, m)`` m⁻¹, root of the weight of each translation."""
+        return np.asarray(np.sqrt(self.weight)[:, None, None] * self.even)
 
     @property
     def right(self) -> np.ndarray:
@@ -189,6 +208,7 @@ class Scale:
         extent: variance of the distance between two places of the map.
         anywhere: ``(C,)`` variance of a wrong closure: to any place of the map, or as far as it states.
         square_length: ``(C,)`` m², expected squared length of each, not per component.
+        shape: shifts in units in which good closures err alike along all axes.
     """
 
     good: np.ndarray
@@ -197,6 +217,7 @@ class Scale:
     extent: float
     anywhere: np.ndarray
     square_length: np.ndarray
+    shape: EvenShifts
 
     @cached_property
     def closure(self) -> float:
@@ -213,12 +234,14 @@ class GivenTurn:
         square: ``(C,)`` squared turn, in standard deviations.
         along: ``(C, m)`` metres, mean.
         spread: ``(C, m)`` m², variance.
+        axes: ``(C, m, m)`` principal axes, in columns.
     """
 
     log_turn: np.ndarray
     square: np.ndarray
     along: np.ndarray
     spread: np.ndarray
+    axes: np.ndarray
 
 
 def given_turn(predictions: Predictions, variance: np.ndarray, turns: int) -> GivenTurn:
@@ -237,6 +260,7 @@ def given_turn(predictions: Predictions, variance: np.ndarray, turns: int) -> Gi
         square,
         np.matmul(axes.transpose(0, 2, 1), given[:, :, None])[:, :, 0],
         np.maximum(spread, 0.0),
+        axes,
     )
 
 

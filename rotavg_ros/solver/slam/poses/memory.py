@@ -99,7 +99,7 @@ class PoseMemory:
         common = np.zeros((problem.num_runs, 6))
         # The verdict on whether the robot keeps a vertical may have changed.
         noise = self.noise if problem.drift_axis is not None else replace(self.noise, tilt=self.noise.turn)
-        state = PoseState(np.ascontiguousarray(correction), position[drawn.nodes], common, noise)
+        state = PoseState(np.ascontiguousarray(correction), position[drawn.nodes], common, noise, self.pose.state.shape)
         column = np.full(graph.num_edges, -1)
         column[self.edge] = np.arange(len(self.edge))
         return PoseStart(state, column[closures], self.places)

@@ -18,6 +18,7 @@ from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.graph.routes import way_along
 from rotavg_ros.solver.slam.poses.closures import ANYHOW, NOTHING, Told
 from rotavg_ros.solver.slam.poses.displacements import Displacements, DrawnSteps
+from rotavg_ros.solver.slam.poses.even_shifts import EvenShifts, likeliest_shape
 from rotavg_ros.solver.slam.poses.even_turns import EvenTurns
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 from rotavg_ros.solver.slam.poses.state import PoseNoise, PoseState
@@ -309,6 +310,25 @@ class PoseProblem:
         is_shared = self.run[self.mode.problem.closure] >= 0
         return np.asarray(noise.of_closures(square_length) - is_shared * noise.common)
 
+    def even_shifts(self, state: PoseState, share: np.ndarray) -> EvenShifts:
+        """Units in which closures' shifts err alike along all axes; a share ``(C,)`` of their variances has a shape."""
+        older = np.minimum(self.graph.source.numpy(), self.graph.target.numpy())[self.closures]
+        body_from_world = np.ascontiguousarray(self.orientations(state)[older].T)
+        frame = self.bases[1].T @ quaternion_rows.matrices(quaternion_rows.inverse(body_from_world)) @ self.bases[1]
+        return EvenShifts.of(self.bases[1].T @ state.shape @ self.bases[1], frame, share)
+
+    def mean_closure_shift(self, shape: np.ndarray) -> float:
+        """Variance of a closure's shift, averaged over components, if that of an even one is 1."""
+        return float(np.trace(self.bases[1].T @ shape @ self.bases[1])) / self.shifts
+
+    def likeliest_shape(self, shape: np.ndarray, along_body: np.ndarray) -> np.ndarray:
+        """``(3, 3)`` shape of closures' shifts in the body's axes, from squares and freedom ``(2, m, m)`` there."""
+        if "shift-axes" in self.mode.problem.without:
+            return shape
+        axes = self.bases[1]
+        found = likeliest_shape(axes.T @ shape @ axes, *along_body)
+        return np.asarray(axes @ found @ axes.T + np.eye(3) - axes @ axes.T)
+
     @cached_property
     def told(self) -> Told:
         """What rotations alone say of closures."""
@@ -440,7 +460,7 @@ class PoseProblem:
         self,
         covariance: np.ndarray,
         rotation_weight: np.ndarray,
-        closure_weight: np.ndarray,
+        closure_root: np.ndarray,
         state: PoseState,
     ) -> np.ndarray:
         """``(E + R, d, d)`` W^½ of all rows.
@@ -448,7 +468,7 @@ class PoseProblem:
         Args:
             covariance: ``(E, m, m)`` covariances of shifts.
             rotation_weight: ``(E, 2)`` rad⁻², about the drift axis and any other one.
-            closure_weight: ``(C,)`` m⁻², used instead of closures' covariances.
+            closure_root: ``(C, m, m)`` m⁻¹, of closures' shifts.
             state: gives the noise.
         """
         k, m = self.turns, self.shifts
@@ -459,7 +479,7 @@ class PoseProblem:
         edges[:, :k, :k] = about * self.about_drift_axis + other * (np.eye(k) - self.about_drift_axis)
         # Upper triangular: Cholesky from the last component backwards.
         edges[:, k:, k:] = inverse_root(covariance[:, ::-1, ::-1])[:, ::-1, ::-1]
-        edges[self.mode.problem.closure, k:, k:] = np.sqrt(closure_weight)[:, None, None] * np.eye(m)
+        edges[self.mode.problem.closure, k:, k:] = closure_root
         if self.num_runs:
             common[:, :k, :k] = np.eye(k) / np.sqrt(self.common_turn(state.noise))
             common[:, k:, k:] = np.eye(m) / np.sqrt(state.noise.common)

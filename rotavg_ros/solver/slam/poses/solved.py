@@ -23,7 +23,8 @@ class Solved:
         way: displacements before the step.
         covariance: ``(E, m, m)`` m², of shifts.
         rotation_weight: ``(E, 2)`` rad⁻², of turns about the drift axis and any other one.
-        closure_weight: ``(C,)`` m⁻², of closures' translations.
+        closure_weight: ``(C,)`` m⁻², of closures' even shifts.
+        even: ``(C, m, m)`` from closures' shifts to these.
         left: ``(E + R, d, 1)`` whitened residuals after the step.
         factor: factor of its normal equations.
         moved: root mean square of the step, in standard errors of the answer.
@@ -38,6 +39,7 @@ class Solved:
     covariance: np.ndarray
     rotation_weight: np.ndarray
     closure_weight: np.ndarray
+    even: np.ndarray
     left: np.ndarray
     factor: BlockFactor
     moved: float
@@ -45,6 +47,16 @@ class Solved:
     predictions: Predictions
     maps: MapTurns
     places: Places
+
+    @property
+    def closure_root(self) -> np.ndarray:
+        """``(C, m, m)`` m⁻¹, root of the weight of each closure's shift."""
+        return np.asarray(np.sqrt(self.closure_weight)[:, None, None] * self.even)
+
+    @property
+    def closure_back(self) -> np.ndarray:
+        """``(C, m, m)`` metres, its inverse."""
+        return np.asarray(np.linalg.inv(self.closure_root))
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,10 @@ class PoseNoise:
         way, step = of_odometry * self.way, of_odometry * self.step
         return replace(self, way=way, step=step, closure=closure, common=common)
 
+    def of_constant_times(self, factor: float) -> PoseNoise:
+        """The noise with a scaled variance of closures' translations, for what neither grows nor is shared."""
+        return replace(self, closure=factor * self.closure)
+
 
 @dataclass(frozen=True)
 class PoseState:
@@ -66,9 +70,12 @@ class PoseState:
         position: ``(K, 3)`` metres.
         common: ``(R, 6)`` common errors of runs: rad, metres.
         noise: all variances.
+        shape: ``(3, 3)`` of what good closures' translations err by however long they are, in the body's axes: its
+            covariance up to its size.
     """
 
     correction: np.ndarray
     position: np.ndarray
     common: np.ndarray
     noise: PoseNoise
+    shape: np.ndarray

@@ -114,7 +114,9 @@ class Linear:
         # A single mean variance for all axes.
         turn = problem.mean_turn(pose.state.noise)
         closure = problem.mean_closure_turn(pose.state.noise)
-        noise = replace(pose.state.noise, turn=turn, tilt=turn, closure_turn=closure)
+        noise = replace(pose.state.noise, turn=turn, tilt=turn, closure_turn=closure).of_constant_times(
+            problem.mean_closure_shift(pose.state.shape)
+        )
         turns, shifts = problem.bases
         segment = problem.segment_of_node
         inside = segment >= 0

@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from rotavg_ros.solver.slam.poses.closures import GOOD, Predictions, Scale, Told
+from rotavg_ros.solver.slam.poses.even_shifts import EvenShifts
 from rotavg_ros.solver.slam.poses.places.classes import CLASSES, Said
 from rotavg_ros.solver.slam.poses.places.pulls import pulled
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
@@ -35,7 +36,15 @@ def said_of(count: int, off: float) -> Said:
     """That all are off by some metres along x, which is known to a metre, in a plane of 50 m."""
     mean = np.tile([0.0, off, 0.0], (count, 1))
     covariance = np.tile(np.diag([1e-4, 1.0, 1.0]), (count, 1, 1))
-    scale = Scale(np.full(count, 0.01), np.full(count, 0.01), np.ones(count), 2500.0, np.full(count, 2500.0), np.zeros(count))
+    scale = Scale(
+        np.full(count, 0.01),
+        np.full(count, 0.01),
+        np.ones(count),
+        2500.0,
+        np.full(count, 2500.0),
+        np.zeros(count),
+        EvenShifts.alike(count, 2),
+    )
     return Said.of(Predictions(mean, covariance), told(count), 1, scale, PlacePriors())
 
 

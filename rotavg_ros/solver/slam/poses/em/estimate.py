@@ -30,6 +30,7 @@ from rotavg_ros.solver.slam.poses.em.convergence import (
 from rotavg_ros.solver.slam.poses.em.evidence import translation_cost
 from rotavg_ros.solver.slam.poses.em.noise import likeliest_noise, log_noise_prior
 from rotavg_ros.solver.slam.poses.em.start import MAX_SOLVES, USUAL, Level, PoseStart, along_odometry
+from rotavg_ros.solver.slam.poses.even_shifts import shape_change
 from rotavg_ros.solver.slam.poses.places.judge import Judge
 from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
@@ -88,13 +89,16 @@ def estimate_poses(
             held = min(held, number)
         if number == most or ending.is_early(number, after, is_at_rest=is_at_rest):
             break
-        if number > held and is_at_rest and noise_rests(noise - state.noise.logarithms):
+        is_held = ending.held_for is not None or number <= held
+        shape = problem.likeliest_shape(state.shape, solved.places.along_body)
+        rests = noise_rests(np.append(noise - state.noise.logarithms, shape_change(shape, state.shape)))
+        if number > held and is_at_rest and rests:
             if judge.counts_tails == counts_tails:
                 break
             # Only now: while variances are too small most closures seem to be in the tails, which keeps them small.
             judge = replace(judge, counts_tails=True)
-        is_held = ending.held_for is not None or number <= held
         state, change = with_noise(solved.state, noise, change, is_held=is_held)
+        state = state if is_held else replace(state, shape=shape)
         places = following(after, problem, solved.scale.square_length, solved.state.noise, state.noise)
     if not hold:
         return PoseMode(problem, solved, math.nan, first)
@@ -119,7 +123,7 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     rotation_weight = 1 / turn_variances
     rotation_weight[closure] = places.rotation_weight[:, None]
     spend(_ROW * len(turn_variances))
-    root = problem.whitening(covariance, rotation_weight, places.weight, state)
+    root = problem.whitening(covariance, rotation_weight, places.closure_root, state)
     jacobian = np.matmul(root, problem.jacobian(way))
     factor = problem.equations.factorise(jacobian, problem.root_weight(rotation_weight, state))
     whitened = np.matmul(root, residual[:, :, None])
@@ -160,6 +164,7 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
         covariance,
         rotation_weight,
         places.weight,
+        places.even,
         left,
         factor,
         moved_by,
@@ -195,8 +200,8 @@ def _log_likely(problem: PoseProblem, solved: Solved) -> float:
 def _nothing_known(problem: PoseProblem, state: PoseState, judge: Judge) -> Places:
     closure = problem.mode.problem.closure
     residual = problem.residuals(state, problem.displacements(problem.orientations(state)))
-    square = (residual[closure, problem.turns :] ** 2).sum(axis=1)
-    return judge.nothing_known(problem.mode.state.is_good[closure], square, _scale(problem, state, problem.stated_square))
+    square, scale = (residual[closure, problem.turns :] ** 2).sum(axis=1), _scale(problem, state, problem.stated_square)
+    return judge.nothing_known(problem.mode.state.is_good[closure], square, scale)
 
 
 def _extent(problem: PoseProblem, state: PoseState) -> float:
@@ -210,13 +215,16 @@ def _scale(problem: PoseProblem, state: PoseState, square_length: np.ndarray) ->
     extent, own = _extent(problem, state), problem.own_variance(state.noise, square_length)
     # A closure may state an absurd length, for which Gaussians of the map's extent would not distinguish its classes.
     anywhere = np.maximum(extent, problem.stated_square / problem.shifts)
-    good = state.noise.of_closures(square_length)
-    return Scale(good, own, state.noise.closure / own, extent, anywhere, square_length)
+    # Errors in proportion to the length, and those that others share with their runs, are alike along all axes.
+    share = state.noise.closure / own
+    shape = problem.even_shifts(state, share)
+    good = state.noise.of_closures(square_length) + (shape.size - 1) * own
+    return Scale(good, shape.size * own, share, extent, anywhere, square_length, shape)
 
 
 def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.ndarray) -> Predictions:
-    """Predictions of some rows by all else, from their residuals and leverages; their ``root`` is diagonal."""
-    sigma = 1 / np.diagonal(root[rows], axis1=1, axis2=2)
+    """Predictions of some rows by all else, from their residuals and leverages."""
+    back = np.linalg.inv(root[rows])
     others, covariance = factor.without(rows)
-    mean = sigma * np.matmul(others, left[rows])[:, :, 0]
-    return Predictions(mean, sigma[:, :, None] * covariance * sigma[:, None, :])
+    mean = np.matmul(back, np.matmul(others, left[rows]))[:, :, 0]
+    return Predictions(mean, np.matmul(np.matmul(back, covariance), back.transpose(0, 2, 1)))

@@ -6,6 +6,7 @@ import numpy as np
 
 from rotavg_ros.solver.slam.poses.closures import Places
 from rotavg_ros.solver.slam.poses.em.noise import log_noise_prior
+from rotavg_ros.solver.slam.poses.even_shifts import log_shape_prior
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import Solved
 
@@ -24,6 +25,7 @@ def translation_cost(problem: PoseProblem, solved: Solved, in_order: Places) -> 
     """
     gained = in_order.log_density - _as_normal(problem, solved) - _gained_by_rotations(problem)
     believed = log_noise_prior(problem, solved.state.noise) - log_noise_prior(problem, problem.turn_noise)
+    believed += log_shape_prior(problem.bases[1].T @ solved.state.shape @ problem.bases[1])
     return _normal(problem, solved) - _normal_of_rotations(problem) - float(gained.sum()) - believed
 
 
@@ -49,7 +51,7 @@ def _log_det(problem: PoseProblem, solved: Solved) -> float:
     if len(problem.loose) == 0:
         return solved.factor.log_det
     state = solved.state
-    root = problem.whitening(solved.covariance, solved.rotation_weight, solved.closure_weight, state)
+    root = problem.whitening(solved.covariance, solved.rotation_weight, solved.closure_root, state)
     jacobian = np.matmul(root, problem.jacobian(solved.way))
     root_weight = problem.root_weight(solved.rotation_weight, state)
     return problem.equations.factorise(jacobian, root_weight, problem.loose_weight(solved.scale.extent)).log_det
@@ -68,7 +70,7 @@ def _as_normal(problem: PoseProblem, solved: Solved) -> np.ndarray:
     k, m, closure = problem.turns, problem.shifts, problem.mode.problem.closure
     total = solved.predictions.covariance.copy()
     total[:, :k, :k] += (1 / solved.rotation_weight[closure, 0])[:, None, None] * np.eye(k)
-    total[:, k:, k:] += (1 / solved.closure_weight)[:, None, None] * np.eye(m)
+    total[:, k:, k:] += np.matmul(solved.closure_back, solved.closure_back.transpose(0, 2, 1))
     mean = solved.predictions.mean
     square = (mean * np.linalg.solve(total, mean[:, :, None])[:, :, 0]).sum(axis=1)
     return np.asarray(-(square + np.linalg.slogdet(total)[1] + (k + m) * np.log(2 * np.pi)) / 2)

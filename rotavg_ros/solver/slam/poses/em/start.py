@@ -103,20 +103,25 @@ class PoseStart:
         is_known = edge < kept.shape[1]
         is_known[is_known] &= ~np.isnan(kept[:, edge[is_known]]).any(axis=0)
         chance, (weight, rotation_weight) = np.split(kept[:, edge[is_known]].astype(np.float64), [CLASSES])
-        none, nothing = np.zeros_like(chance), np.zeros(3)
-        places = Places(chance, weight, rotation_weight, nothing, nothing, np.zeros(len(weight)), none, none)
+        none, zeros = np.zeros_like(chance), np.zeros(3)
+        even, nothing = np.tile(np.eye(problem.shifts), (len(weight), 1, 1)), np.zeros((2, *[problem.shifts] * 2))
+        places = Places(chance, weight, rotation_weight, zeros, zeros, np.zeros(len(weight)), none, none, even, nothing)
         column = np.where(is_known, np.cumsum(is_known) - 1, -1)
         state = replace(along_odometry(problem), noise=PoseNoise(*noise.tolist()))
         return cls(state, column, places, MAX_SOLVES)
 
     def over(self, places: Places) -> Places:
         """These places, with those of new closures taken from ``places``."""
-        is_new, column = self.column < 0, self.column
+        is_new, column, even = self.column < 0, self.column, self.places.even
+        if even.shape[1:] != places.even.shape[1:]:
+            # The robot has left the plane.
+            even = np.tile(np.eye(places.even.shape[1]), (len(even), 1, 1))
         return replace(
             places,
             chance=np.where(is_new, places.chance, self.places.chance[:, column]),
             weight=np.where(is_new, places.weight, self.places.weight[column]),
             rotation_weight=np.where(is_new, places.rotation_weight, self.places.rotation_weight[column]),
+            even=np.where(is_new[:, None, None], places.even, even[column]),
         )
 
 
@@ -127,5 +132,5 @@ def along_odometry(problem: PoseProblem, level: Level = USUAL) -> PoseState:
     if problem.turns_share:
         common[:, :3] = mode.state.common
     nowhere = np.zeros((problem.drawn.num_nodes, 3))
-    state = PoseState(mode.state.correction, nowhere, common, problem.turn_noise.of_shifts_times(*level))
+    state = PoseState(mode.state.correction, nowhere, common, problem.turn_noise.of_shifts_times(*level), np.eye(3))
     return replace(state, position=problem.along_odometry(problem.displacements(problem.orientations(state))))

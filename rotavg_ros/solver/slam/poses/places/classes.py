@@ -36,7 +36,9 @@ class Said:
         turned: ``(2, C)`` rad² per component, variances of turns of good ones and of wrong places seen nearly alike.
         variance: ``(J, C)`` m² per component, of ε.
         log_turn: ``(J, C)`` nats, log densities of turns.
-        along, spread: ``(J, C, m)`` metres and m², mean and variance of shifts given turns, along principal axes.
+        along, spread: ``(J, C, m)`` metres and m², mean and variance of shifts given turns, along principal axes; for
+            good closures of even shifts.
+        axes: ``(C, m, m)`` those axes of even shifts, in columns.
         anywhere: ``(C, m)`` metres and m² of shifts, marginal over turns, likewise.
     """
 
@@ -48,13 +50,15 @@ class Said:
     log_turn: np.ndarray
     along: np.ndarray
     spread: np.ndarray
+    axes: np.ndarray
     anywhere: tuple[np.ndarray, np.ndarray]
 
     @classmethod
     def of(cls, predictions: Predictions, told: Told, turns: int, scale: Scale, priors: PlacePriors) -> Said:
         """Under one choice of noise."""
         turned = np.stack((told.rotation_variance, told.rotation_variance + np.radians(priors.turned_deg) ** 2))
-        here, elsewhere = (given_turn(predictions, variance, turns) for variance in turned)
+        here = given_turn(predictions.even(scale.shape.even), turned[0], turns)
+        elsewhere = given_turn(predictions, turned[1], turns)
         spread = np.stack([here.spread] * GOOD + [elsewhere.spread] * ELSEWHERE)
         along = np.stack([here.along] * GOOD + [elsewhere.along] * ELSEWHERE)
         # A repeat has the turn and shift of the closure that it repeats, which is seen nearly at the right angle.
@@ -62,7 +66,7 @@ class Said:
         log_turn = np.stack([here.log_turn] * GOOD + [elsewhere.log_turn] * WRONG + [repeats])
         variance = _variances(scale, priors)
         anywhere = along_axes(predictions, turns)
-        return cls(predictions, turns, scale, turned, variance, log_turn, along, spread, anywhere)
+        return cls(predictions, turns, scale, turned, variance, log_turn, along, spread, here.axes, anywhere)
 
     @cached_property
     def total(self) -> np.ndarray:
@@ -99,6 +103,9 @@ class Said:
         variance = np.concatenate((self.variance, self.scale.anywhere[None]))[:, :, None]
         total = spread + variance
         mean, shrunk = variance * along / total, variance * spread / total
+        back = np.matmul(self.scale.shape.uneven, self.axes)
+        mean[:GOOD] = np.matmul(back, mean[:GOOD, :, :, None])[:, :, :, 0]
+        shrunk[:GOOD] = np.matmul(back**2, shrunk[:GOOD, :, :, None])[:, :, :, 0]
         return np.sqrt(over_components(mean**2)), over_components(shrunk) / shrunk.shape[2]
 
 

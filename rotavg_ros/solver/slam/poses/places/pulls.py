@@ -36,6 +36,8 @@ def pulled(said: Said, told: Told, log_class: np.ndarray, number: np.ndarray) ->
         np.append(turn_freedom, (at_good * own / total).sum(axis=axes)),
         log_density,
         *said.errors(),
+        said.scale.shape.even,
+        _along_body(said, chance[good] * known),
     )
 
 
@@ -55,7 +57,8 @@ def nothing_known(told: Told, priors: PlacePriors, is_good: np.ndarray, square: 
     turn = np.where(is_good, 1.0, NOTHING) / told.rotation_variance
     none = np.zeros_like(chance)
     zeros = np.zeros(3), np.zeros(3), np.zeros(len(is_good))
-    return Places(chance, _least_weight(square, scale), turn, *zeros, none, none)
+    even = scale.shape.even
+    return Places(chance, _least_weight(square, scale), turn, *zeros, none, none, even, np.zeros((2, *even.shape[1:])))
 
 
 def _shift_weight(said: Said, told: Told, classes: tuple[np.ndarray, np.ndarray], number: np.ndarray) -> np.ndarray:
@@ -74,6 +77,23 @@ def _shift_weight(said: Said, told: Told, classes: tuple[np.ndarray, np.ndarray]
     pull = over_components(each / total).sum(axis=0) / components
     shrunk = over_components(each * variance / total).sum(axis=0) / components + chance[-1]
     return np.asarray(pull / shrunk)
+
+
+def _along_body(said: Said, chance: np.ndarray) -> np.ndarray:
+    """``(2, m, m)`` squares and freedom of what has a shape (:func:`~even_shifts.likeliest_shape`).
+
+    Args:
+        said: densities in each class.
+        chance: ``(2, C)`` probabilities of both classes of good closures.
+    """
+    good, shape = slice(GOOD), said.scale.shape
+    shaped = said.scale.floor_share / shape.size
+    total, share = said.total[good], (chance * said.variance[good] * shaped)[:, :, None]
+    axes = np.matmul(np.matmul(shape.frame.transpose(0, 2, 1), shape.even), said.axes)
+    pulled = np.matmul(axes, (np.sqrt(share) * said.along[good] / total)[:, :, :, None])[:, :, :, 0]
+    pulled = pulled.reshape(-1, pulled.shape[2])
+    expected = (share / total).sum(axis=0)[:, None, :]
+    return np.stack((pulled.T @ pulled, np.matmul(axes * expected, axes.transpose(0, 2, 1)).sum(axis=0)))
 
 
 def _of_turns(said: Said, chance: np.ndarray) -> tuple[np.ndarray, float, float]:

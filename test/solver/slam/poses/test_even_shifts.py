@@ -1,0 +1,100 @@
+"""Closures whose translations err more along one of the body's axes than along others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.metrics.positions import position_errors
+from rotavg_ros.solver import solve
+from rotavg_ros.solver.slam.poses.even_shifts import EvenShifts, likeliest_shape
+from rotavg_ros.view_graph import ViewGraph
+
+from .test_poses import errors, graph_of, pose_mode, simulated
+from .test_steps import seen_again
+
+# As a scanner errs in a corridor: ahead, in units of its error sideways.
+AHEAD = 8.0
+# From the body's axes to those of a camera that looks ahead.
+CAMERA = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+
+
+def error(graph: ViewGraph, truth: np.ndarray, method: str = "neurora") -> float:
+    """Root mean square, metres."""
+    position = solve(graph, method=method).position
+    assert position is not None
+    return float(np.sqrt((position_errors(np.asarray(position), truth) ** 2).mean()))
+
+
+def of_camera(graph: ViewGraph) -> ViewGraph:
+    """The same edges between frames of the body turned as a camera is."""
+    assert graph.translation is not None
+    turned = CAMERA.inv() * Rotation.from_quat(graph.target_from_source.numpy()) * CAMERA
+    way = torch.from_numpy(CAMERA.inv().apply(graph.translation.numpy()))
+    return replace(graph, target_from_source=torch.from_numpy(turned.as_quat()), translation=way)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("camera", [False, True])
+def test_the_axes_are_found(camera: bool) -> None:
+    """Whatever the body's axes are called."""
+    graph, _ = seen_again(0, ahead=AHEAD)
+    pose = pose_mode(of_camera(graph) if camera else graph)
+    variance, axes = np.linalg.eigh(pose.state.shape)
+    assert np.sqrt(variance[-1] / variance[0]) == pytest.approx(AHEAD, rel=0.25)
+    ahead = CAMERA.inv().apply([0.0, 1.0, 0.0]) if camera else np.array([0.0, 1.0, 0.0])
+    assert abs(axes[:, -1] @ ahead) > 0.99
+
+
+@pytest.mark.parametrize(("ahead", "least", "most"), [(0.4, 0.0, 0.95), (0.0, 0.97, 1.03)])
+def test_positions_in_a_building_are_better_by_it(ahead: float, least: float, most: float) -> None:
+    """Where closures err by so many metres more along corridors; otherwise little changes."""
+    ratio = []
+    for seed in range(3):
+        run = simulated(seed)
+        graph = graph_of(run)
+        assert graph.translation is not None
+        way, closure = graph.translation.clone(), ~graph.is_odometry
+        way[closure, 0] += ahead * torch.from_numpy(np.random.default_rng(seed).normal(size=int(closure.sum())))
+        graph = replace(graph, translation=way)
+        found, alike = (errors(run, solve(graph, method=each))[1] for each in ("neurora", "neurora~shift-axes"))
+        ratio.append(found / alike)
+    assert least < np.exp(np.mean(np.log(ratio))) < most
+
+
+def test_the_direction_of_closures_does_not_matter() -> None:
+    graph, truth = seen_again(1, ahead=AHEAD, odometry=0.1)
+    assert graph.translation is not None
+    back = ~graph.is_odometry & (torch.arange(graph.num_edges) % 2 == 0)
+    source, target = torch.where(back, graph.target, graph.source), torch.where(back, graph.source, graph.target)
+    turn = Rotation.from_quat(graph.target_from_source.numpy())
+    inverse = torch.from_numpy(turn.inv().as_quat())
+    # A translation is that of the target in the source's frame.
+    way = torch.from_numpy(-turn.apply(graph.translation.numpy()))
+    turned = replace(
+        graph,
+        source=source,
+        target=target,
+        target_from_source=torch.where(back[:, None], inverse, graph.target_from_source),
+        translation=torch.where(back[:, None], way, graph.translation),
+    )
+    assert error(turned, truth) == pytest.approx(error(graph, truth), rel=1e-3)
+
+
+def test_the_shape_of_a_sample_is_found() -> None:
+    """Squares of shifts that nothing else predicts badly are those of the shape, and it is where iterations end."""
+    rng = np.random.default_rng(0)
+    truth = np.array([[4.0, 1.0], [1.0, 0.5]])
+    truth /= np.sqrt(np.linalg.det(truth))
+    drawn = rng.multivariate_normal(np.zeros(2), truth, 20000)
+    shape = np.eye(2)
+    for _ in range(3):
+        even = EvenShifts.of(shape, np.eye(2)[None], np.ones(1)).even[0]
+        pulled = drawn @ even @ even
+        shape = likeliest_shape(shape, pulled.T @ pulled, len(drawn) * even @ even)
+    np.testing.assert_allclose(shape, truth, rtol=0.05, atol=0.02)
+    np.testing.assert_allclose(np.linalg.det(shape), 1.0)
