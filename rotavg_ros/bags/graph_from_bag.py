@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros.bags.edge_frames import EdgeFrames
 from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION, RELATIVE_ROTATION_ARRAY
 from rotavg_ros.bags.messages import Edge, Keyframe, read_edge, read_edges, read_odometry
+from rotavg_ros.bags.odometry_of_graph import Pose, check_time, is_oriented, is_sound, taken_messages
 from rotavg_ros.bags.reader import BagReader, BagReadError
 from rotavg_ros.bags.topics import (
     EDGE_ARRAY_TOPIC,
@@ -28,17 +29,10 @@ from rotavg_ros.bags.topics import (
 from rotavg_ros.datasets.files.graph_file import MAX_NODE_ID, GraphFile
 from rotavg_ros.datasets.interpolation import poses_at
 from rotavg_ros.datasets.planar import are_about_z, are_level
-from rotavg_ros.online import EstimatorOptions
-from rotavg_ros.online.odometry.data_time import DataTime
-from rotavg_ros.online.odometry.time_jumps import RUN_LENGTH
-from rotavg_ros.online.options import NANOSECONDS
-from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, ViewGraphError, where_possible
+from rotavg_ros.view_graph import EdgeKind, ViewGraphError, where_possible
 
 # Largest difference between a stamp that names a keyframe and the stamp of its odometry message.
 _MAX_KEYFRAME_DISTANCE_NS = 50_000_000
-
-# Stamp in ns, position, world-from-body xyzw.
-_Pose = tuple[int, list[float], list[float]]
 
 _EDGES = {EDGE_TOPIC: RELATIVE_ROTATION, EDGE_ARRAY_TOPIC: RELATIVE_ROTATION_ARRAY}
 
@@ -52,8 +46,8 @@ class _Content:
     """The content of a bag's known topics, in the order of recording."""
 
     edges: list[Edge] = field(default_factory=list)
-    odometry: list[_Pose] = field(default_factory=list)
-    truth: list[_Pose] = field(default_factory=list)
+    odometry: list[Pose] = field(default_factory=list)
+    truth: list[Pose] = field(default_factory=list)
     note: dict[str, Any] = field(default_factory=dict)
     edge_topics: str = ""
     repeated: int = 0
@@ -74,10 +68,11 @@ def read_graph_bag(path: str | Path) -> GraphFile:
     """Read the graph in a bag.
 
     Where the edges name their ends by id, they are the graph, in the order of the edges' own numbers. Where they name
-    them by stamp, every odometry message is a keyframe, consecutive ones are joined by odometry edges, and an end
-    belongs to the nearest odometry message within 0.05 s; edges without such a message are skipped and counted, as are
-    those that are the same as one before, since the sender has repeated itself. Edges between sensors are converted to
-    the body's frame by the bag's static transforms. From a damaged bag, everything that can be read is used.
+    them by stamp, every odometry message that the estimator would take is a keyframe, consecutive ones are joined by
+    odometry edges except where odometry begins anew, and an end belongs to the nearest of them within 0.05 s. Edges
+    without such a message are skipped and counted, as are those that are the same as one before, since the sender has
+    repeated itself. Edges between sensors are converted to the body's frame by the bag's static transforms. From a
+    damaged bag, everything that can be read is used.
 
     Raises:
         BagReadError: an unreadable bag, one without edges, or one that needs odometry and has none, or odometry whose
@@ -89,9 +84,9 @@ def read_graph_bag(path: str | Path) -> GraphFile:
         content = _read(bag)
         if not content.by_id:
             bag.require(ODOM_TOPIC, ODOMETRY)
-            if not any(map(_is_sound, content.odometry)):
+            if not any(map(is_sound, content.odometry)):
                 raise BagReadError(f"{path}: {ODOM_TOPIC} has no messages with a pose, so there are no keyframes")
-            _check_time(path, content.odometry)
+            check_time(path, content.odometry)
         damage = bag.damage
     _check(path, content)
     try:
@@ -144,28 +139,6 @@ def _check(path: str | Path, content: _Content) -> None:
             raise BagReadError(f"{path}: edge {edge.id} is of the unknown kind {edge.kind}")
 
 
-def _check_time(path: str | Path, odometry: list[_Pose]) -> None:
-    """Refuse odometry whose time goes back: in order of its stamps it would leap to and fro between two places.
-
-    Messages that are the same as one before are no harm, as in a recording of a bag in a loop, nor are stray ones.
-    """
-    options, time, known = EstimatorOptions(), DataTime(), set[tuple[float, ...]]()
-    in_a_row = 0
-    for row, (stamp_ns, position, rotation) in enumerate(odometry):
-        message = (stamp_ns, *position, *rotation)
-        now_ns = time.advance(stamp_ns, options.continuity_limits.lead_ns)
-        if now_ns is not None:
-            time.claimed_ns = None  # only the next message may confirm a stamp far ahead
-        back_ns = 0 if now_ns is None else now_ns - stamp_ns
-        in_a_row = in_a_row + 1 if back_ns > options.time_jump_ns and message not in known else 0
-        known.add(message)
-        if in_a_row == RUN_LENGTH:
-            raise BagReadError(
-                f"{path}: {ODOM_TOPIC}: time goes back by {back_ns / NANOSECONDS:.1f} s after {row + 1 - RUN_LENGTH} "
-                "messages, and a graph has room for one time; `rotavg replay` reads the bag, with a component for each"
-            )
-
-
 def _from_ids(content: _Content) -> GraphFile:
     proper = [position for position, edge in enumerate(content.edges) if edge.source.id != edge.target.id]
     order = sorted(proper, key=lambda position: content.edges[position].id)
@@ -196,27 +169,26 @@ def _from_ids(content: _Content) -> GraphFile:
 
 
 def _from_stamps(content: _Content) -> GraphFile:
-    sound = [message for message in content.odometry if _is_sound(message)]
-    poses = sorted({stamp: (position, rotation) for stamp, position, rotation in sound}.items())
-    stamps_ns = np.array([stamp for stamp, _ in poses], dtype=np.int64)
-    position = np.array([pose[0] for _, pose in poses])
-    world_from_body = Rotation.from_quat([pose[1] for _, pose in poses])
+    taken, chain, skipped = taken_messages(content.odometry)
+    stamps_ns = np.array([stamp for stamp, _, _ in taken], dtype=np.int64)
+    position = np.array([place for _, place, _ in taken])
+    world_from_body = Rotation.from_quat([rotation for _, _, rotation in taken])
     ends = np.array([[_nearest(stamps_ns, end) for end in (edge.source, edge.target)] for edge in content.edges])
     ends = ends.reshape(-1, 2)
     usable = (ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])
     closures = [edge for edge, keep in zip(content.edges, usable, strict=True) if keep]
 
-    num_steps = len(stamps_ns) - 1
-    previous_from_next = (world_from_body[:-1].inv() * world_from_body[1:]).as_quat().reshape(-1, 4)
-    steps = world_from_body[:-1].inv().apply(np.diff(position, axis=0)).reshape(-1, 3)
+    before = np.flatnonzero(np.diff(chain) == 0)
+    num_steps = len(before)
+    previous_from_next = (world_from_body[before].inv() * world_from_body[before + 1]).as_quat().reshape(-1, 4)
+    steps = world_from_body[before].inv().apply(position[before + 1] - position[before]).reshape(-1, 3)
     measured = np.array([edge.source_from_target for edge in closures]).reshape(-1, 4)
     source_from_target = np.concatenate((previous_from_next, measured))
-    source = np.concatenate((np.arange(num_steps), ends[usable, 0]))
-    target = np.concatenate((np.arange(1, num_steps + 1), ends[usable, 1]))
+    source = np.concatenate((before, ends[usable, 0]))
+    target = np.concatenate((before + 1, ends[usable, 1]))
     order = np.argsort(np.maximum(source, target), kind="stable")
     translations = _possible(np.concatenate((steps, _translations(closures))))
-    skipped = {
-        "odometry messages without a pose": len(content.odometry) - len(sound),
+    skipped |= {
         "edges without odometry at their stamps, or with both ends at one": int((~usable).sum()),
         _REPEATED: content.repeated,
     }
@@ -231,19 +203,19 @@ def _from_stamps(content: _Content) -> GraphFile:
         edge_translation=translations[order],
         skipped=_counted(skipped),
     )
+    content.warnings += _told_of_parts(int(chain[-1]))
     return replace(graph_file, stamps_ns=stamps_ns)
+
+
+def _told_of_parts(num_anew: int) -> tuple[str, ...]:
+    """A line where odometry has begun anew."""
+    if not num_anew:
+        return ()
+    return (f"odometry begins anew {num_anew} ×; only closures join what was before to what comes after",)
 
 
 def _counted(skipped: dict[str, int]) -> dict[str, int]:
     return {what: count for what, count in skipped.items() if count}
-
-
-def _is_oriented(message: _Pose) -> bool:
-    return abs(float(np.linalg.norm(message[2])) - 1) <= UNIT_NORM_TOLERANCE
-
-
-def _is_sound(message: _Pose) -> bool:
-    return _is_oriented(message) and bool(np.isfinite(message[1]).all())
 
 
 def _translations(edges: Sequence[Edge]) -> NDArray[np.float64]:
@@ -282,11 +254,11 @@ def _with_truth(graph_file: GraphFile, content: _Content) -> GraphFile:
         if nodes := nodes_at.get(stamp):
             node = nodes.pop(0) if len(nodes) > 1 else nodes[0]
             position[node] = true_position
-            if _is_oriented((stamp, true_position, true_orientation)):
+            if is_oriented((stamp, true_position, true_orientation)):
                 orientation[node] = np.array(true_orientation) * _CONJUGATE
     if content.truth:
         if not content.note:
-            _fill(graph_file.stamps_ns, [pose for pose in content.truth if _is_oriented(pose)], position, orientation)
+            _fill(graph_file.stamps_ns, [pose for pose in content.truth if is_oriented(pose)], position, orientation)
         if np.isfinite(orientation).any():
             graph_file = replace(graph_file, body_from_world_gt=orientation)
         if content.note.get("position_gt", True):
@@ -298,7 +270,7 @@ def _with_truth(graph_file: GraphFile, content: _Content) -> GraphFile:
 
 def _fill(
     stamps_ns: NDArray[np.int64],
-    truth: list[_Pose],
+    truth: list[Pose],
     position: NDArray[np.float64],
     orientation: NDArray[np.float64],
 ) -> None:

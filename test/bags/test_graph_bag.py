@@ -23,6 +23,8 @@ from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.datasets.simulation.robot_run import RobotRun
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.datasets.simulation.trajectories import World
+from rotavg_ros.online import EstimatorOptions, OnlineEstimator
+from rotavg_ros.view_graph import EdgeKind
 
 
 def simulated(seed: int = 0, **changes: object) -> SimulatedRun:
@@ -310,7 +312,42 @@ def test_time_that_goes_back_makes_no_graph(tmp_path: Path, what: str) -> None:
         with pytest.raises(BagReadError, match=r"time goes back by 3\.5 s after 60 messages.*`rotavg replay`"):
             read_graph_bag(tmp_path / "bag")
     else:
-        assert read_graph_bag(tmp_path / "bag").graph.num_nodes == (60 if what == "in a loop" else 58)
+        assert read_graph_bag(tmp_path / "bag").graph.num_nodes == (60 if what == "in a loop" else 57)
+
+
+@pytest.mark.parametrize("what", ["begins anew", "after a pause", "a wild pose"])
+def test_odometry_is_taken_as_the_estimator_takes_it(
+    tmp_path: Path, what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A robot that was switched off starts at zero again: no edge of odometry leads there from where it was."""
+    estimator = OnlineEstimator(EstimatorOptions(keyframe_angle=0, keyframe_distance=0))
+    second = 10**9
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic(EDGE_TOPIC, RELATIVE_ROTATION)
+        bag.add_topic(ODOM_TOPIC, ODOMETRY)
+        for index in range(40):
+            is_new = index >= 20 and what != "a wild pose"
+            stamp = (index + 1) * second // 10 + 500 * second * (is_new and what == "after a pause")
+            angle, x = (0.0, 0.1 * (index - 20)) if is_new else (2.0 + 0.1 * index, 30.0 + index)
+            x += 5000.0 * (what == "a wild pose" and index == 25)
+            turned = Rotation.from_euler("z", angle).as_quat()
+            bag.write(ODOM_TOPIC, stamp, odometry_message(stamp, np.array([x, 0, 0]), turned, "odom"))
+            estimator.add_odometry("", stamp, turned, (x, 0, 0))
+        closure = edge(0, Keyframe(None, second), Keyframe(None, 2 * second))
+        bag.write(EDGE_TOPIC, 1000 * second, edge_message(closure))
+    expected = estimator.snapshot()
+    read = read_graph_bag(tmp_path / "bag")
+    odometry = read.graph.kind == EdgeKind.ODOMETRY
+    assert read.stamps_ns is not None
+    np.testing.assert_array_equal(read.stamps_ns, expected.stamp_ns)
+    for name in ("source", "target"):
+        assert torch.equal(getattr(read.graph, name)[odometry], getattr(expected.graph, name)), name
+    difference = read.graph.target_from_source[odometry] - expected.graph.target_from_source
+    assert float(difference.abs().max()) < 1e-12
+    np.testing.assert_allclose(read.graph.translation[odometry], expected.translation, atol=1e-12)
+    assert len(expected.stamp_ns) - expected.graph.num_edges == (1 if what == "a wild pose" else 2)
+    assert main(["convert", str(tmp_path / "bag"), str(tmp_path / "graph.g2o")]) == 0
+    assert ("odometry begins anew 1 ×" in capsys.readouterr().err) == (what != "a wild pose")
 
 
 def test_odometrys_steps_are_kept_where_no_closure_states_a_translation(tmp_path: Path) -> None:
