@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 import textwrap
 from array import array
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from rotavg_ros.errors import UserError
@@ -144,6 +146,14 @@ def check_options(options: Any) -> None:
     owner: type = type(options)
     for each in options_of(owner):
         each.checked(each.written(options))
+
+
+def path_of(written: str) -> Path | None:
+    """The path that an option names; None if it is empty.
+
+    ``~`` is the home folder: in a parameter file, or behind ``name:=``, no shell has put it there.
+    """
+    return Path(os.path.expanduser(written)) if written else None
 
 
 def documented(owner: _Class) -> _Class:

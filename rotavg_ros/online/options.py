@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from rotavg_ros.online.odometry.continuity import ContinuityLimits
 from rotavg_ros.online.odometry.keyframe_choice import KeyframePolicy
 from rotavg_ros.online.odometry.samples import OdometryBounds
 from rotavg_ros.online.odometry.time_jumps import POLICIES
-from rotavg_ros.option import DEGREES, DEGREES_PER_SECOND, METRES, METRES_PER_SECOND, check_options, documented, option
+from rotavg_ros.option import (
+    DEGREES,
+    DEGREES_PER_SECOND,
+    METRES,
+    METRES_PER_SECOND,
+    check_options,
+    documented,
+    option,
+    path_of,
+)
 from rotavg_ros.solver import DEVICES, PROFILES, TRANSLATION_SCALES
 
 NANOSECONDS = 1_000_000_000
@@ -149,7 +157,7 @@ class EstimatorOptions:
             "profile": self.profile,
             "device": self.device,
             "refinement_steps": None if self.refinement_steps < 0 else self.refinement_steps,
-            "weights": Path(self.weights) if self.weights else None,
+            "weights": path_of(self.weights),
         }
 
     @property

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any
 
 from rotavg_ros.inputs import BRINGS_KEYFRAMES, FRAMELESS_ODOMETRY, Source
 from rotavg_ros.online import EstimatorOptions, quaternion
 from rotavg_ros.online.quaternion import Quaternion
-from rotavg_ros.option import Option, OptionError, check_options, option, options_of
+from rotavg_ros.option import Option, OptionError, check_options, option, options_of, path_of
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE
 
 NODE_NAME = "rotavg"
@@ -179,6 +180,11 @@ class NodeParameters:
                 raise OptionError(
                     f"publish_tf places the odometry's frame, and {entry} has none; use another odometry, or no tf"
                 )
+
+    @property
+    def state_path(self) -> Path | None:
+        """The state file; None: none."""
+        return path_of(self.state_file)
 
     def forwarded(self) -> dict[str, str]:
         """Outputs of the edge topics that are sent on, by topic."""

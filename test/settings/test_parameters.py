@@ -63,6 +63,17 @@ def test_the_units_of_the_library_are_those_of_its_names() -> None:
     assert NodeParameters().changed({"weights": "robot"}).estimator.for_solver["weights"] == Path("robot")
 
 
+def test_a_path_may_begin_with_the_home_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """As no shell puts it into a parameter file; ``state_file: ~/state`` made a folder of the name ``~`` necessary."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    homely = NodeParameters().changed({"state_file": "~/maps/state", "weights": "~/robot"})
+    assert homely.state_path == tmp_path / "maps" / "state"
+    assert homely.estimator.for_solver["weights"] == tmp_path / "robot"
+    assert homely.values()["state_file"] == "~/maps/state"
+    assert NodeParameters().changed({"state_file": "maps/~state"}).state_path == Path("maps/~state")
+    assert NodeParameters().state_path is None
+
+
 def test_a_change_keeps_the_rest_and_ignores_other_nodes_parameters() -> None:
     first = NodeParameters().changed({"gauge": "identity", "robots": ["a"], "use_sim_time": True})
     second = first.changed({"solve_period_s": 2})

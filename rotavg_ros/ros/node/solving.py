@@ -61,7 +61,7 @@ class Solving:
         self._outputs = outputs
         self._forwarding = forwarding
         self._parameters = parameters
-        self._state_file = state_file = Path(parameters.state_file) if parameters.state_file else None
+        self._state_file = state_file = parameters.state_path
         self._budget = TickBudget()
         self.tick_budget_s = math.inf
         self._publishing = threading.Lock()  # an answer goes out before it is forgotten, or not at all
