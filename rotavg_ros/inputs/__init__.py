@@ -13,12 +13,19 @@ from rotavg_ros.inputs.records import (
     Source,
     WholeGraphConverter,
 )
-from rotavg_ros.inputs.registry import BRINGS_KEYFRAMES, EDGE_CONVERTERS, FRAMELESS_ODOMETRY, ODOMETRY_CONVERTERS
+from rotavg_ros.inputs.registry import (
+    BRINGS_KEYFRAMES,
+    EDGE_CONVERTERS,
+    FRAMELESS_ODOMETRY,
+    NAMES_ITS_BODY,
+    ODOMETRY_CONVERTERS,
+)
 
 __all__ = [
     "BRINGS_KEYFRAMES",
     "EDGE_CONVERTERS",
     "FRAMELESS_ODOMETRY",
+    "NAMES_ITS_BODY",
     "ODOMETRY_CONVERTERS",
     "EdgeConverter",
     "EdgeRecord",

@@ -39,6 +39,9 @@ BRINGS_KEYFRAMES = frozenset(_FOREIGN)
 # Its frame_id is the frame attached to the body; it does not name the frame in which the body turns.
 FRAMELESS_ODOMETRY = "sensor_msgs/msg/Imu"
 
+# Odometry whose messages may name the frame whose motion they describe.
+NAMES_ITS_BODY = frozenset({"nav_msgs/msg/Odometry", FRAMELESS_ODOMETRY})
+
 # Types that carry the rotation of a robot's odometry.
 ODOMETRY_CONVERTERS: dict[str, OdometryConverter] = {
     "nav_msgs/msg/Odometry": from_odometry,

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from itertools import islice
-
 from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.bags.topics import static_transforms
-from rotavg_ros.inputs import ODOMETRY_CONVERTERS
+from rotavg_ros.inputs import NAMES_ITS_BODY, ODOMETRY_CONVERTERS
 from rotavg_ros.inputs.sensor_frames import SensorFrames
 from rotavg_ros.online import EdgeMeasurement
 from rotavg_ros.online.measurements import RejectedInputError
-from rotavg_ros.replay.plan import Plan
+from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.replay.plan import Input, Plan
 
 
 class BagFrames:
@@ -28,13 +27,9 @@ class BagFrames:
             self._sensors.take(message)
         parameters = plan.parameters
         for robot, source, sensor in zip(parameters.robots, plan.odometry, parameters.odometry_sensors(), strict=False):
-            for _, _, message in islice(bag.decoded([source.topic]), 1):
-                try:
-                    frame = ODOMETRY_CONVERTERS[source.type_name](message, sensor).child_frame_id
-                except RejectedInputError:
-                    continue
-                self._sensors.note_body(robot, frame, sensor)
-                self._bodies |= {frame} if frame else set()
+            frame = _frame_of_body(bag, source, sensor) if self._is_on else ""
+            self._sensors.note_body(robot, frame, sensor)
+            self._bodies |= {frame} if frame else set()
 
     def edge_of_body(self, edge: EdgeMeasurement, frame: str, topic: str) -> EdgeMeasurement:
         """The edge between bodies; unchanged if the mounting of the sensor is not known."""
@@ -57,3 +52,15 @@ class BagFrames:
                 "between them: its edges are taken as they are; set edge_sensor_orientations"
             )
         return lines
+
+
+def _frame_of_body(bag: BagReader, source: Input, sensor: Quaternion) -> str:
+    """The frame whose motion odometry describes, by the first message that names one, as in the node; empty: none."""
+    for _, _, message in bag.decoded([source.topic] if source.type_name in NAMES_ITS_BODY else []):
+        try:
+            frame = ODOMETRY_CONVERTERS[source.type_name](message, sensor).child_frame_id
+        except RejectedInputError:
+            continue
+        if frame:
+            return frame
+    return ""

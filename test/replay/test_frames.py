@@ -67,8 +67,8 @@ def static_transform() -> Any:
     return types[TF]([types["geometry_msgs/msg/TransformStamped"](header, "camera", transform)])
 
 
-def write_bag(path: Path, with_tf: bool) -> None:
-    """The transform comes last, as where its broadcaster was started late."""
+def write_bag(path: Path, with_tf: bool, nameless: int = 0) -> None:
+    """The transform comes last, as where its broadcaster was started late; the first messages may name no body."""
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         topics = {"/odom": ODOMETRY, "/relative_rotations": RELATIVE_ROTATION, "/tf_static": TF}
         connections = {
@@ -80,7 +80,9 @@ def write_bag(path: Path, with_tf: bool) -> None:
 
         for second in range(SECONDS):
             turned, here = body(second)
-            write("/odom", stamp(second), odometry_message(stamp(second), here, turned.as_quat(), "odom"))
+            message = odometry_message(stamp(second), here, turned.as_quat(), "odom")
+            message.child_frame_id = "" if second < nameless else "base_link"
+            write("/odom", stamp(second), message)
         for number in range(LAP):
             write("/relative_rotations", stamp(SECONDS), closure(number))
         if with_tf:
@@ -101,8 +103,9 @@ def replayed(bag: Path, output: Path, *options: str) -> dict[str, Any]:
     return json.loads((output / "summary.json").read_text())
 
 
-def test_the_bags_own_transforms(tmp_path: Path) -> None:
-    write_bag(tmp_path / "bag", with_tf=True)
+@pytest.mark.parametrize("nameless", [0, 1])
+def test_the_bags_own_transforms(tmp_path: Path, nameless: int) -> None:
+    write_bag(tmp_path / "bag", with_tf=True, nameless=nameless)
     summary = replayed(tmp_path / "bag", tmp_path / "out")
     degrees, metres = residuals(tmp_path / "out")
     assert (degrees < 1e-3).all() and (metres < 1e-3).all()
