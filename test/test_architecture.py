@@ -204,7 +204,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "compaction": {"measurements"},
         "odometry": {"growing_array", "measurements", "quaternion"},
         "content": {"answer", "graph", "measurements", "options", "quaternion"},
-        "current_content": {"content", "measurements", "options", "state"},
+        "current_content": {"content", "measurements", "odometry", "options", "state"},
         "ticks": {"answer", "content", "current_content", "free_memory", "options"},
         "": {"answer", "estimator", "measurements", "options", "state"},
         "answer": {"compaction", "graph", "measurements", "odometry", "quaternion"},

@@ -22,6 +22,7 @@ from collections.abc import Callable
 
 from rotavg_ros.online.content import Content, ContentState
 from rotavg_ros.online.measurements import OdometryMessage, RejectReason
+from rotavg_ros.online.odometry.time_jumps import TimeBefore
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.state.discarded import Discarded
 
@@ -70,6 +71,7 @@ class CurrentContent:
         self.paused = False
         self._on_discard = on_discard
         self._running: RunningTick | None = None
+        self._time_before: TimeBefore | None = None
 
     def add_odometry(self, message: OdometryMessage) -> RejectReason | None:
         """Take an odometry message; where it shows that time went back, the options decide what happens.
@@ -77,6 +79,8 @@ class CurrentContent:
         Returns:
             why it was refused and counted; None if it was taken.
         """
+        if self._time_before is not None and self._time_before.has(message.robot, message.stamp_ns):
+            return self.content.state.growth.refuse(RejectReason.OUT_OF_ORDER_ODOMETRY)
         reason, since_jump = self.content.add_odometry(message)
         if not since_jump:
             return reason
@@ -89,14 +93,18 @@ class CurrentContent:
             return reason
         return [self.content.add_odometry(message)[0] for message in since_jump][-1]
 
-    def clock_went_back(self, now_ns: int) -> None:
-        """The clock that stamps the data went back to ``now_ns``; the options decide what happens."""
-        data_time_ns = self.content.state.growth.data_time.now_ns
+    def clock_went_back(self, now_ns: int, from_ns: int | None) -> None:
+        """The clock that stamps the data went back, see :meth:`OnlineEstimator.clock_went_back`; the options decide."""
+        tracks, data_time_ns = self.content.builder.tracks, self.content.state.growth.data_time.now_ns
         if data_time_ns is None or data_time_ns - now_ns <= self.options.time_jump_ns:
             return  # no data from after it are known, or odometry has shown the jump already
         if self.options.on_time_jump == "reset":
             self.time_jumps += 1
+            latest = ((robot, track.latest) for robot, track in tracks.items())
+            latest_ns = {robot: sample.stamp_ns for robot, sample in latest if sample is not None}
             self.forget()
+            until_ns = data_time_ns if from_ns is None else from_ns
+            self._time_before = TimeBefore(latest_ns, until_ns, self.options.time_jump_ns)
         elif self.options.on_time_jump == "new_component":
             self.time_jumps += self.content.builder.clock_went_back(now_ns)
 
@@ -114,6 +122,7 @@ class CurrentContent:
         """Begin with this content; the one before is handed to ``on_discard`` unless it is empty."""
         discarded = Discarded(self.content.state)
         self.generation += 1
+        self._time_before = None
         self.content = Content(state)
         self.content.builder.set_options(self.options)  # they may have changed while a file was read
         self._abandon_tick("everything was forgotten or replaced meanwhile")

@@ -98,10 +98,16 @@ class OnlineEstimator:
         with self._lock:
             return self._current.add_odometry(message)
 
-    def clock_went_back(self, now_ns: int) -> None:
-        """The clock that stamps the data (``/clock``) went back to ``now_ns``; treated as if odometry had shown it."""
+    def clock_went_back(self, now_ns: int, from_ns: int | None = None) -> None:
+        """The clock that stamps the data (``/clock``) went back; treated as if odometry had shown it.
+
+        Args:
+            now_ns: what it shows now.
+            from_ns: what it showed before. Odometry up to then may still be under way; it belongs to the time before.
+                None: all of it has come.
+        """
         with self._lock:
-            self._current.clock_went_back(now_ns)
+            self._current.clock_went_back(now_ns, from_ns)
 
     def add_edge(self, edge: EdgeMeasurement, generation: int | None = None) -> RejectReason | None:
         """Take a measured edge.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -92,6 +93,30 @@ class BackwardJumps:
     def is_back(self) -> bool:
         """Whether a robot's clock went back and its messages have been late ever since."""
         return bool(self._told)
+
+
+class TimeBefore:
+    """Recognises odometry of a time that is forgotten: the clock went back while it was still under way."""
+
+    def __init__(self, latest_ns: Mapping[str, int], until_ns: int, threshold_ns: int) -> None:
+        """Remember where each robot's odometry was.
+
+        Args:
+            latest_ns: stamp of the last message of each robot.
+            until_ns: what the clock showed before it went back.
+            threshold_ns: going back by no more than this is not a jump.
+        """
+        self._latest_ns, self._until_ns, self._threshold_ns = dict(latest_ns), until_ns, threshold_ns
+
+    def has(self, robot: str, stamp_ns: int) -> bool:
+        """Whether a message belongs to it: until its robot's first that is back, or that the clock had not reached."""
+        latest_ns = self._latest_ns.get(robot)
+        if latest_ns is None:
+            return False
+        if latest_ns - self._threshold_ns <= stamp_ns <= self._until_ns + self._threshold_ns:
+            return True
+        del self._latest_ns[robot]
+        return False
 
 
 def _longest_step_ns(taken_ns: NDArray[np.int64]) -> float:

@@ -133,10 +133,10 @@ class RotavgNode(parameter_server.ParameterNode):
     def _on_solve_timer(self) -> None:
         self._worker.submit_once(self._solving.tick_quietly)
 
-    def _on_clock_jump(self, _jump: TimeJump) -> None:
+    def _on_clock_jump(self, jump: TimeJump) -> None:
         """Simulated time went back, which can only happen with ``use_sim_time``."""
-        time_jumps = self._estimator.time_jumps
-        self._estimator.clock_went_back(self.get_clock().now().nanoseconds)
+        time_jumps, now_ns = self._estimator.time_jumps, self.get_clock().now().nanoseconds
+        self._estimator.clock_went_back(now_ns, now_ns - jump.delta.nanoseconds)  # the delta is negative
         if self._estimator.time_jumps != time_jumps:
             self._on_time_jump()
 

@@ -237,6 +237,29 @@ def test_odometry_that_the_clock_overtakes_belongs_to_the_time_before(restart: b
     assert online.time_jumps == (0 if restart else 1) and online.counts().rejected == {}
 
 
+def test_with_reset_odometry_that_the_clock_overtakes_is_forgotten_once() -> None:
+    """What was under way belongs to the time before: it made a graph of its own, which was then forgotten as well."""
+    online, once = estimator("reset"), estimator("reset")
+    feed(online, range(40))
+    online.clock_went_back(0, LENGTH * SECOND // 10)
+    assert feed(online, range(40, LENGTH)) == [RejectReason.OUT_OF_ORDER_ODOMETRY] * (LENGTH - 40)
+    assert online.add_edge(closure(1, 0, 2 * SECOND)) is None
+    feed(online, range(70))  # beyond the stamps of then
+    assert once.add_edge(closure(1, 0, 2 * SECOND)) is None
+    feed(once, range(70))
+    assert graph(online) == graph(once) and ends(online) == ends(once) == [(0, 20)]
+    assert (online.time_jumps, online.generation) == (1, 1)
+
+
+def test_with_reset_odometry_of_another_clock_goes_on() -> None:
+    """Its stamps are none that the clock that went back has shown."""
+    online = estimator("reset")
+    feed(online, range(40), 1000 * SECOND)
+    online.clock_went_back(0, 4 * SECOND)
+    assert feed(online, range(40, LENGTH), 1000 * SECOND) == [None] * (LENGTH - 40)
+    assert online.counts().keyframes == LENGTH - 40
+
+
 def test_odometry_that_does_not_follow_the_clock_goes_on() -> None:
     online = estimator("new_component")
     feed(online, range(40))
