@@ -21,6 +21,7 @@ from rotavg_ros.bags.lost import Lost
 from rotavg_ros.bags.message_types import typestore
 from rotavg_ros.bags.salvage import salvaging_reader
 from rotavg_ros.errors import UserError, asking_about
+from rotavg_ros.packed import head_of, how_to_unpack
 
 # Suffixes of files that can be bags by themselves.
 RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
@@ -321,6 +322,8 @@ def _bag_of(path: Path, salvage: bool) -> Path:
             f"it by `unzstd {shlex.quote(str(path))}`"
         )
     if not is_folder and path.suffix not in (*RECORDING_SUFFIXES, COMPRESSED_SUFFIX):
+        if (what := how_to_unpack(path, head_of(path))) is not None:
+            raise BagReadError(f"{path}: {what}")
         raise BagReadError(f"{path}: give a rosbag2 folder, or a file with suffix {', '.join(RECORDING_SUFFIXES)}")
     bag = path.parent if path.name in listed else path
     with asking_about(path, BagReadError):

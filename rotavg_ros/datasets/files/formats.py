@@ -8,6 +8,7 @@ from types import ModuleType
 from rotavg_ros.datasets.files import g2o, isam, lund, npz, onedsfm, toro
 from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, open_text, reading
 from rotavg_ros.datasets.files.text_rows import NUMBER_STARTS, read_blocks
+from rotavg_ros.packed import head_of, how_to_unpack
 
 _FORMAT_OF_SUFFIX = {
     ".g2o": g2o,
@@ -87,6 +88,8 @@ def _format_of_content(path: Path, head: bytes) -> ModuleType:
         return lund
     for start, suffix in _RECORDINGS.items():
         if head.startswith(start):
+            if (packed := how_to_unpack(path, head_of(path))) is not None:
+                raise GraphFileError.at(path, None, packed)
             what = f"is a bag; `rotavg replay` takes it, and `rotavg convert` makes a view-graph of a {suffix} file"
             raise GraphFileError.at(path, None, what)
     first_row = next((row for block in read_blocks(path) for _, row in block), [b""])

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from rotavg_ros.errors import UserError
+from rotavg_ros.packed import HEAD, how_to_unpack
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph, where_possible
 from rotavg_ros.whole_file import replacing
 
@@ -28,7 +29,7 @@ MAX_NODE_ID = np.iinfo(np.int64).max
 # With fewer ids, or a smaller share of neighbours that are joined, the nodes may be cameras instead of keyframes.
 _MIN_CHAIN, _CHAIN_SHARE = 10, 0.9
 
-_GZIP = b"\x1f\x8b"
+_GZIP, _ZIP = b"\x1f\x8b", b"PK"
 
 
 class GraphFileError(UserError):
@@ -185,7 +186,7 @@ def open_text(path: Path) -> Iterator[io.BufferedReader]:
     """A text's bytes from the first character on, decompressed if gzipped, without a byte order mark.
 
     Raises:
-        GraphFileError: the file cannot be read, is UTF-16, or is a damaged gzip file.
+        GraphFileError: the file cannot be read, is UTF-16, a damaged gzip file, or packed by anything but gzip.
     """
     with reading(path), ExitStack() as stack:
         file = stack.enter_context(path.open("rb"))
@@ -198,6 +199,10 @@ def open_text(path: Path) -> Iterator[io.BufferedReader]:
                 raise GraphFileError.at(path, None, what)
             if start.startswith(codecs.BOM_UTF8):
                 file.read(len(codecs.BOM_UTF8))
+            # Archives of zip, which npz is one of, are told by their content; tar may be packed by gzip.
+            head = file.peek(HEAD)[:HEAD]
+            if not head.startswith(_ZIP) and (packed := how_to_unpack(path, head)) is not None:
+                raise GraphFileError.at(path, None, packed)
             yield file
         except (EOFError, gzip.BadGzipFile, zlib.error) as error:
             raise GraphFileError.at(path, None, f"is a damaged gzip file: {error}; get or pack it again") from None
