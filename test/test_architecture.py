@@ -22,6 +22,7 @@ INWARD: dict[str, set[str]] = {
     "hamilton": set(),
     "startup": set(),
     "packed": set(),
+    "yaml_keys": set(),
     "whole_file": set(),
     "wording": set(),
     "rotations": {"hamilton"},
@@ -45,6 +46,7 @@ INWARD: dict[str, set[str]] = {
         "version",
         "view_graph",
         "whole_file",
+        "yaml_keys",
     },
     "online": {
         "errors",
@@ -58,7 +60,7 @@ INWARD: dict[str, set[str]] = {
         "whole_file",
     },
     "inputs": {"online", "view_graph"},
-    "settings": {"inputs", "online", "option", "view_graph"},
+    "settings": {"inputs", "online", "option", "view_graph", "yaml_keys"},
 }
 # Inside a wing, the rooms (modules and folders) that a room may import; "" is what the folder's own name gives.
 ROOMS: dict[str, dict[str, set[str]]] = {

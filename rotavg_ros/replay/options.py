@@ -12,12 +12,11 @@ import yaml
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.option import OptionError
+from rotavg_ros.settings.parameter_file import ANY_NODE, repeated_parameter
 from rotavg_ros.settings.parameters import NODE_NAME, PARAMETERS
 
 Values = dict[str, Any]
 
-# Node names in parameter files that match any node.
-_ANY_NODE = ("*", "**")
 # Prefixes of the parameters that rclpy gives every node.
 _RCLPYS = ("qos_overrides.", "start_type_description_service", "use_sim_time")
 
@@ -60,17 +59,21 @@ def read_parameter_file(path: Path) -> tuple[Values, list[str]]:
 
     Raises:
         ReplayOptionError: no such file, not YAML or one that refers to itself, not a parameter file of the node, or of
-            more than one, or an invalid value.
+            more than one, or an invalid value, or a parameter that is there twice.
     """
     try:
-        nodes = [(name, list(_flat(said))) for name, said in _nodes(_content(path.read_text(encoding="utf-8")))]
+        text = path.read_text(encoding="utf-8")
+        nodes = [(name, list(_flat(said))) for name, said in _nodes(_content(text))]
+        repeated = repeated_parameter(path, text, NODE_NAME)
     except (OSError, UnicodeDecodeError) as error:
         raise ReplayOptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     except yaml.YAMLError as error:
         raise ReplayOptionError(f"{path}: is not YAML: {' '.join(str(error).split())}") from None
     except RecursionError:
         raise ReplayOptionError(f"{path}: is nested too deeply, or refers to itself; write its values out") from None
-    of_node = {NODE_NAME, *_ANY_NODE}
+    if repeated is not None:
+        raise ReplayOptionError(repeated)
+    of_node = {NODE_NAME, *ANY_NODE}
     meant = [(name, said) for name, said in nodes if name.rpartition("/")[2] in of_node]
     if not meant:
         raise ReplayOptionError(

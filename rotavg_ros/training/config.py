@@ -12,6 +12,7 @@ import yaml
 
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily, RobotFamilyError
 from rotavg_ros.errors import UserError
+from rotavg_ros.yaml_keys import repeated_keys
 
 # Number of seeds that torch tells apart.
 _SEEDS = 1 << 64
@@ -105,10 +106,12 @@ class TrainingConfig:
         """Read a YAML file.
 
         Raises:
-            TrainingConfigError: unreadable, unknown key, or a value of the wrong type or range.
+            TrainingConfigError: unreadable, unknown or repeated key, or a value of the wrong type or range.
         """
         try:
-            content = yaml.safe_load(path.read_text())
+            text = path.read_text()
+            content = yaml.safe_load(text)
+            repeated = next(repeated_keys(text), None)
         except OSError as error:
             raise TrainingConfigError(f"{path}: cannot be read ({error.strerror}); give a YAML file") from None
         except (ValueError, yaml.YAMLError) as error:  # not UTF-8, a date that does not exist
@@ -116,6 +119,8 @@ class TrainingConfig:
             raise TrainingConfigError(f"{path}: not a readable YAML file ({reason})") from None
         except RecursionError:
             raise TrainingConfigError(f"{path}: is nested too deeply; expected `key: value` lines") from None
+        if repeated is not None:
+            raise TrainingConfigError(repeated.told(path))
         if not isinstance(content, dict):
             raise TrainingConfigError(f"{path}: expected `key: value` lines, found {type(content).__name__}")
         return cls.from_dict(content, str(path))

@@ -123,6 +123,7 @@ def test_mistakes_take_one_line(
         ("seed: 18446744073709551616", "it must be a whole number from 0 to 2⁶⁴ - 1"),
         ("epochs: 3\n\tgraphs: 4", "line 2"),
         ("graphs: .inf", "graphs is inf"),
+        ("epochs: 3\nseed: 1\nepochs: 5", ":3: epochs is there already in line 1; leave one of them"),
     ],
 )
 def test_bad_configurations(text: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -130,8 +131,8 @@ def test_bad_configurations(text: str, message: str, tmp_path: Path, capsys: pyt
     path.write_text(text)
     assert main(["train", "clean-net", str(path), "--output", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
-    assert f"{path}: " in error
-    assert message in error
+    assert f"{path}:" in error
+    assert message in error and error.count("\n") == 1
 
 
 def test_a_folder_of_a_configurations_name_is_not_meant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

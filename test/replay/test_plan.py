@@ -184,6 +184,39 @@ def test_a_file_without_an_end_is_refused(tmp_path: Path, content: str) -> None:
         read_settings([f"robots:={'[' * 5000}{']' * 5000}"])
 
 
+PARAMETERS = "  ros__parameters:\n    max_keyframes: 100\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (
+            f"/rotavg:\n{PARAMETERS}    gauge: odometry\n    max_keyframes: 200\n",
+            ":5: max_keyframes is there already in ",
+        ),
+        (
+            f"/**:\n{PARAMETERS}    max_keyframes: 100\n",
+            ":4: max_keyframes is there already in line 3; leave one of them",
+        ),
+        (f"/a/rotavg:\n{PARAMETERS}{PARAMETERS}", ":4: ros__parameters is there already in line 2"),
+        (f"/rotavg:\n{PARAMETERS}/rotavg:\n{PARAMETERS}", ":4: /rotavg is there already in line 1"),
+        (f"/rotavg:\n{PARAMETERS}/other:\n{PARAMETERS}    max_keyframes: 200\n", None),
+        (f"/rotavg:\n{PARAMETERS}/**:\n{PARAMETERS}", None),
+        (f"x: &x {{max_keyframes: 7}}\n/rotavg:\n{PARAMETERS}    <<: *x\n", None),
+    ],
+)
+def test_a_parameter_that_is_there_twice_is_refused(tmp_path: Path, content: str, told: str | None) -> None:
+    """ROS takes the last and says nothing. What stands twice in another node's part is that node's matter."""
+    path = tmp_path / "node.yaml"
+    path.write_text(content)
+    if told is None:
+        assert read_parameter_file(path) == ({"max_keyframes": 100}, [])
+        return
+    with pytest.raises(ReplayOptionError) as caught:
+        read_parameter_file(path)
+    assert str(caught.value).startswith(f"{path}{told}") and "\n" not in str(caught.value)
+
+
 ANGLE = {"keyframe_angle_deg": 7.0}
 
 

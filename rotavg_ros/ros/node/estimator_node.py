@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -54,6 +55,7 @@ class RotavgNode(parameter_server.ParameterNode):
             super().__init__(NODE_NAME)
         except Exception as error:  # rclpy has a type of its own for each of its own parameters
             raise UserError(" ".join(str(error).split())) from error
+        parameter_server.refuse_repeated(self, sys.argv)
         self._settings = parameters = parameter_server.declare(self)
         self._solver = Solver(parameters, process)
         device = self._solver.warm_up(parameters.estimator)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+import yaml
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.option import Option, OptionError
-from rotavg_ros.settings.parameters import PARAMETERS, NodeParameters
+from rotavg_ros.settings.parameter_file import repeated_parameter
+from rotavg_ros.settings.parameters import NODE_NAME, PARAMETERS, NodeParameters
 
 # Prefix of rclpy's parameters that change a topic's quality of service.
 _QOS = "qos_overrides"
@@ -27,6 +31,28 @@ class ParameterNode(Node):
             return super().set_parameters_atomically([_as_wanted(each) for each in parameter_list])
         except OptionError as error:
             return SetParametersResult(successful=False, reason=str(error))
+
+
+def refuse_repeated(node: Node, arguments: Sequence[str]) -> None:
+    """Refuse a parameter that stands twice in one of the files that a process was started with: ROS takes the last.
+
+    Args:
+        node: whose parameters count; others' are theirs.
+        arguments: the process's.
+
+    Raises:
+        UserError: there is one.
+    """
+    for flag, file in pairwise(arguments):
+        if flag != "--params-file":
+            continue
+        try:
+            text = Path(file).read_text(encoding="utf-8")
+            line = repeated_parameter(Path(file), text, NODE_NAME, node.get_name())
+        except (OSError, ValueError, yaml.YAMLError, RecursionError):
+            continue  # whatever rclpy has read of it counts
+        if line is not None:
+            raise UserError(line)
 
 
 def declare(node: Node) -> NodeParameters:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup
 from rclpy.parameter import Parameter
 
 from rotavg_ros import EstimatorOptions
+from rotavg_ros.errors import UserError
 from rotavg_ros.option import OptionError
 from rotavg_ros.replay.options import ReplayOptionError, read_parameter_file, read_settings
 from rotavg_ros.ros.node import parameter_server
@@ -79,6 +81,16 @@ def test_mistakes_are_one_clear_line(make_node, overrides: dict[str, object], me
     with pytest.raises(OptionError, match=message) as refusal:
         parameter_server.declare(make_node(**overrides))
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(("node_name", "is_refused"), [("/fleet/rotavg", True), ("/**", True), ("/other", False)])
+def test_a_parameter_that_is_there_twice_is_refused(make_node, tmp_path, node_name: str, is_refused: bool) -> None:
+    path = tmp_path / "node.yaml"
+    path.write_text(f"{node_name}:\n  ros__parameters:\n    gauge: identity\n    gauge: odometry\n")
+    arguments = ["rotavg_node", "--ros-args", "--params-file", str(path), "--params-file", "missing.yaml"]
+    told = pytest.raises(UserError, match=rf"^{path}:4: gauge is there already in line 3")
+    with told if is_refused else nullcontext():
+        parameter_server.refuse_repeated(make_node(), arguments)
 
 
 def test_unknown_parameters_are_named_with_a_suggestion(make_node) -> None:
