@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.backend_bases import FigureCanvasBase
 
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files.formats import read_graph, stem_of
@@ -24,11 +25,27 @@ class PlotError(UserError):
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw."""
-    if arguments.output is not None and arguments.output.is_dir():
-        raise PlotError(f"{arguments.output}: is a folder; give --output a picture's name in it, such as noise.png")
-    if arguments.output is not None and not arguments.output.suffix:
-        arguments.output = arguments.output.with_name(f"{arguments.output.name}.png")
+    if arguments.output is not None:
+        arguments.output = _picture(arguments.output)
     return _run_training(arguments) if arguments.kind == "training" else _run_statistics(arguments)
+
+
+def _picture(output: Path) -> Path:
+    """The file to draw into; a solve that may take minutes comes first, so what is wrong with it is said before.
+
+    Raises:
+        PlotError: a folder, or a place or a kind of picture that cannot be written.
+    """
+    if output.is_dir():
+        raise PlotError(f"{output}: is a folder; give --output a picture's name in it, such as noise.png")
+    if not output.parent.is_dir():
+        raise PlotError(f"{output}: there is no folder {output.parent}; make it first")
+    if not output.suffix:
+        return output.with_name(f"{output.name}.png")
+    usable = sorted(FigureCanvasBase.get_supported_filetypes())
+    if output.suffix.lower().removeprefix(".") not in usable:
+        raise PlotError(f"{output}: unknown suffix {output.suffix!r}; use .png, or one of {', '.join(usable)}")
+    return output
 
 
 def _run_training(arguments: argparse.Namespace) -> int:
@@ -61,7 +78,7 @@ def _run_statistics(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _writing(output: Path) -> Iterator[None]:
-    """For a block in which matplotlib writes ``output``; it raises a ValueError for an unknown suffix."""
+    """For a block in which matplotlib writes ``output``."""
     try:
         yield
     except UserError:

@@ -247,9 +247,21 @@ def test_plot_statistics(knows_truth: bool, tmp_path: Path, capsys: pytest.Captu
     picture = tmp_path / "picture.png"
     assert main(["plot", "statistics", str(tmp_path / "graph.npz"), "--output", str(picture)]) == 0
     assert picture.read_bytes().startswith(b"\x89PNG")
-    assert main(["plot", "statistics", str(tmp_path / "graph.npz"), "--output", str(tmp_path / "x.what")]) == 2
-    assert "x.what: cannot be written" in capsys.readouterr().err
     assert main(["plot", "statistics", str(tmp_path / "none.npz")]) == 2
+
+
+@pytest.mark.parametrize("kind", ["statistics", "training"])
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("x.what", "unknown suffix '.what'; use .png"), ("none/x.png", "there is no folder"), ("", "is a")],
+)
+def test_a_picture_that_cannot_be_written_is_told_of_before_any_work(
+    kind: str, name: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not even the graph is read: there is none."""
+    assert main(["plot", kind, str(tmp_path / "none.npz"), "--output", str(tmp_path / name)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"rotavg: error: {tmp_path / name}: {told}") and error.count("\n") == 1
 
 
 def test_plot_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
