@@ -129,3 +129,19 @@ def test_a_front_end_that_counts_from_zero_again_is_told_by_its_odometry(solver,
     assert estimator.add_edge(again) == ("contradictory_odometry" if is_refused else None)
     assert estimator.counts().rejected == ({"contradictory_odometry": 1} if is_refused else {})
     assert estimator.counts().edges == edges + (not is_refused)
+
+
+@pytest.mark.parametrize("same_ns", [True, False])
+@pytest.mark.parametrize("which", ["source", "target"])
+def test_a_second_odometry_between_the_same_keyframes_is_another_measurement(solver, same_ns, which):
+    """Of two that differ the solver finds the wrong one; before, the one that came first was all it saw. Keyframes of
+    the same ids and other stamps are others: their front end has begun anew."""
+    estimator = make(solver, replace(OPTIONS, keyframe_source="edges"))
+    ends = {"source": KeyframeReference("r", 0, 5 * SECOND), "target": KeyframeReference("r", 1, 6 * SECOND)}
+    first = EdgeMeasurement(0, **ends, target_from_source=(0, 0, 0, 1), kind=EdgeKind.ODOMETRY)
+    moved = ends | {which: replace(ends[which], stamp_ns=ends[which].stamp_ns + (not same_ns))}
+    turned = tuple(Rotation.from_euler("z", 30, degrees=True).as_quat())
+    other = EdgeMeasurement(1, **moved, target_from_source=turned, kind=EdgeKind.ODOMETRY)
+    assert estimator.add_edge(first) is None
+    assert estimator.add_edge(other) == (None if same_ns else "contradictory_odometry")
+    assert estimator.counts().edges == 1 + same_ns

@@ -97,6 +97,9 @@ class EdgePlacement:
     def _check_repeated_odometry(self, edge: EdgeMeasurement) -> None:
         """Refuse odometry of a front end that has begun anew and uses the same ids for other places.
 
+        Where both ends state the moments that the graph has for their keyframes, they are the same keyframes. However
+        different, the rotation is then another measurement, as of a second odometry, and the solver judges both.
+
         Raises:
             RejectedInputError: the graph has very different odometry between these keyframes.
         """
@@ -106,8 +109,19 @@ class EdgePlacement:
             return
         ends = (source.robot, source.keyframe_id), (target.robot, target.keyframe_id)
         known = self._growth.graph.odometry_between(*ends)
-        if known is not None and contradict(known, edge.target_from_source):
+        if known is None or not contradict(known, edge.target_from_source):
+            return
+        if not all(map(self._states_its_moment, (source, target))):
             raise RejectedInputError(RejectReason.CONTRADICTORY_ODOMETRY)
+
+    def _states_its_moment(self, end: KeyframeReference) -> bool:
+        """Whether an end by id has the stamp, and is on the time line, of the graph's keyframe with this id."""
+        growth = self._growth
+        assert end.keyframe_id is not None
+        node = growth.graph.node(end.robot, end.keyframe_id)
+        if node is None or end.stamp_ns is None:
+            return False
+        return growth.graph.moment_of(node) == (end.stamp_ns, growth.time_line_of(end.robot, end.stamp_ns))
 
     def _undecided_end(self, edge: EdgeMeasurement) -> KeyframeReference | None:
         """The first end whose stamp matters and may belong to either of two time lines."""
