@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from rotavg_ros import rotations
+from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS
 
 
 @dataclass(frozen=True)
@@ -71,37 +72,57 @@ class MarginalizedKeyframes:
 
 
 @dataclass(frozen=True)
+class Forgotten:
+    """Which keyframes may have been marginalised without anything of them being known any more.
+
+    Attributes:
+        ids: by robot index: keyframes up to this id.
+        stamps_ns: by robot index and time line: keyframes up to this stamp. Ids that are made of stamps do not ascend
+            where a clock goes back, so keyframes that are named by their stamps are judged by these.
+    """
+
+    ids: Mapping[int, int] = field(default_factory=dict)
+    stamps_ns: Mapping[tuple[int, int], int] = field(default_factory=dict)
+
+    def together_with(self, keyframes: MarginalizedKeyframes) -> Forgotten:
+        """With these keyframes, too."""
+        ids, stamps_ns = dict(self.ids), dict(self.stamps_ns)
+        for robot in np.unique(keyframes.robot).tolist():
+            of_robot = keyframes.robot == robot
+            ids[robot] = max(int(keyframes.keyframe_id[of_robot].max()), ids.get(robot, 0))
+            for line in np.unique(keyframes.time_line[of_robot]).tolist():
+                newest_ns = int(keyframes.stamp_ns[of_robot & (keyframes.time_line == line)].max())
+                stamps_ns[robot, line] = max(newest_ns, stamps_ns.get((robot, line), UNKNOWN_STAMP_NS))
+        return Forgotten(ids, stamps_ns)
+
+
+@dataclass(frozen=True)
 class MarginalizedIndex:
     """Finds marginalised keyframes by key and by moment.
 
     Attributes:
         keyframes: those that can be found.
-        forgotten_up_to: by robot index: keyframes up to this id may have been marginalised, but their poses are
-            forgotten.
+        forgotten: those that cannot be found any more.
     """
 
     keyframes: MarginalizedKeyframes
-    forgotten_up_to: Mapping[int, int]
+    forgotten: Forgotten
     _by_id: NDArray[np.int64]
     _by_moment: NDArray[np.int64]
 
     @classmethod
-    def of(cls, keyframes: MarginalizedKeyframes, forgotten_up_to: Mapping[int, int]) -> MarginalizedIndex:
+    def of(cls, keyframes: MarginalizedKeyframes, forgotten: Forgotten) -> MarginalizedIndex:
         by_id = np.lexsort((keyframes.keyframe_id, keyframes.robot))
         by_moment = np.lexsort((keyframes.stamp_ns, keyframes.time_line, keyframes.robot))
-        return cls(keyframes, forgotten_up_to, by_id, by_moment)
+        return cls(keyframes, forgotten, by_id, by_moment)
 
     def limited_to(self, capacity: int) -> MarginalizedIndex:
         """The index with at most ``capacity`` keyframes; the first ones are forgotten."""
         surplus = len(self.keyframes) - capacity
         if surplus <= 0:
             return self
-        forgotten = self.keyframes.select(np.arange(surplus))
-        up_to = dict(self.forgotten_up_to)
-        for robot in np.unique(forgotten.robot).tolist():
-            highest = int(forgotten.keyframe_id[forgotten.robot == robot].max())
-            up_to[robot] = max(highest, up_to.get(robot, 0))
-        return MarginalizedIndex.of(self.keyframes.select(np.arange(surplus, len(self.keyframes))), up_to)
+        forgotten = self.forgotten.together_with(self.keyframes.select(np.arange(surplus)))
+        return MarginalizedIndex.of(self.keyframes.select(np.arange(surplus, len(self.keyframes))), forgotten)
 
     def by_id(self, robot: int, keyframe_id: int) -> int | None:
         """Row of a keyframe."""
@@ -115,7 +136,12 @@ class MarginalizedIndex:
         return _find(self._by_moment, columns, (robot, time_line, stamp_ns))
 
     def is_forgotten(self, robot: int, keyframe_id: int) -> bool:
-        return keyframe_id <= self.forgotten_up_to.get(robot, -1)
+        """Whether a keyframe of this id may have been forgotten."""
+        return keyframe_id <= self.forgotten.ids.get(robot, -1)
+
+    def is_moment_forgotten(self, robot: int, time_line: int, stamp_ns: int) -> bool:
+        """Whether a keyframe of this stamp on this time line may have been forgotten."""
+        return stamp_ns <= self.forgotten.stamps_ns.get((robot, time_line), UNKNOWN_STAMP_NS)
 
     def nearest_end(
         self, row: int, target_from_source: NDArray[np.float64], translation: NDArray[np.float64], steps: float

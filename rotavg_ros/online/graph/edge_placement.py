@@ -160,14 +160,14 @@ class EdgePlacement:
             time_line = growth.time_line_of(end.robot, end.stamp_ns)
             if end.keyframe_id is not None and (chosen_by_front_end or growth.options.unknown_keyframes == "create"):
                 keyframe_id = end.keyframe_id
+                was_there = growth.graph.was_marginalized(end.robot, keyframe_id)
             elif end.keyframe_id is None and chosen_by_front_end:
-                if growth.graph.marginalized_keyframe(end.robot, None, stamp_ns, time_line) is not None:
-                    continue
                 keyframe_id = growth.graph.free_id(end.robot, stamp_ns, (stamp_ns, time_line))
+                was_there = growth.graph.was_moment_marginalized(end.robot, stamp_ns, time_line)
             else:
                 continue
             is_new = growth.graph.node(end.robot, keyframe_id) is None
-            if is_new and (growth.graph.was_marginalized(end.robot, keyframe_id) or not growth.has_room_for_keyframe()):
+            if is_new and (was_there or not growth.has_room_for_keyframe()):
                 continue
             growth.graph.add_keyframe(end.robot, keyframe_id, stamp_ns, time_line)
             self.place_all(growth.pending.pop_keyframe(end.robot, keyframe_id))

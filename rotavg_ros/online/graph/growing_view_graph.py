@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rotavg_ros.odometry_route import ROUTE_COLUMNS
 from rotavg_ros.online.compaction.marginalization import Columns, marginalize
-from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
+from rotavg_ros.online.compaction.marginalized_keyframes import Forgotten, MarginalizedIndex, MarginalizedKeyframes
 from rotavg_ros.online.compaction.renumbering import Renumbering
 from rotavg_ros.online.compaction.thinning import thin
 from rotavg_ros.online.graph.keyframe_index import KeyframeIndex
@@ -47,7 +47,7 @@ class GrowingViewGraph:
     def __init__(self) -> None:
         self.revision = 0
         self.robots: list[str] = []
-        self.marginalized = MarginalizedIndex.of(MarginalizedKeyframes.none(), {})
+        self.marginalized = MarginalizedIndex.of(MarginalizedKeyframes.none(), Forgotten())
         self._robot_index: dict[str, int] = {}
         self._index: list[KeyframeIndex] = []  # by robot
         self._keyframe = {name: GrowingArray(dtype) for name, dtype in _KEYFRAME_COLUMNS.items()}
@@ -189,6 +189,12 @@ class GrowingViewGraph:
             return True
         return self.marginalized.is_forgotten(self._robot_index.get(robot, -1), keyframe_id)
 
+    def was_moment_marginalized(self, robot: str, stamp_ns: int, time_line: int) -> bool:
+        """Whether there was a keyframe of this moment, known or forgotten."""
+        if self._marginalized_row(robot, None, stamp_ns, time_line) is not None:
+            return True
+        return self.marginalized.is_moment_forgotten(self._robot_index.get(robot, -1), time_line, stamp_ns)
+
     def compact(
         self,
         surplus_keyframes: int,
@@ -226,7 +232,7 @@ class GrowingViewGraph:
         for name, edge_column in self._edge.items():
             edge_column.replace(contraction.edges[name])
         self._index_anew()
-        known = MarginalizedIndex.of(contraction.marginalized, self.marginalized.forgotten_up_to)
+        known = MarginalizedIndex.of(contraction.marginalized, self.marginalized.forgotten)
         self.marginalized = known.limited_to(max_marginalized)
         self.revision += 1
         edge_of = np.full(len(place), -1)

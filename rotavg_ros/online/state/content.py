@@ -16,7 +16,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.online.answer.anchoring import corrections
 from rotavg_ros.online.answer.gauge import is_numbered_by_first_node
 from rotavg_ros.online.answer.last_answer import LastAnswer
-from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
+from rotavg_ros.online.compaction.marginalized_keyframes import Forgotten, MarginalizedIndex, MarginalizedKeyframes
 from rotavg_ros.online.content import ContentState
 from rotavg_ros.online.graph.builder import GraphBuilder
 from rotavg_ros.online.graph.fingerprints import Fingerprints
@@ -95,7 +95,8 @@ def collect(content: ContentState) -> State:
         "backward_jumps": growth.backward_jumps.header(),
         "rejected": dict(growth.rejected),
         "room": asdict(growth.room),
-        "forgotten_up_to": list(marginalized.forgotten_up_to.items()),
+        "forgotten_up_to": list(marginalized.forgotten.ids.items()),
+        "forgotten_stamps": [[*key, stamp_ns] for key, stamp_ns in marginalized.forgotten.stamps_ns.items()],
         "labels": [[robot, edge_id, int(label)] for (robot, edge_id), label in growth.labels.items()],
     }
     return State(arrays, header, growth.pending.waiting())
@@ -196,12 +197,19 @@ def _graph(arrays: Arrays, header: dict[str, Any]) -> GrowingViewGraph:
             graph=replace(checked, target_from_source=as_saved, **routes),
             robots=tuple(header["robots"]),
             marginalized=MarginalizedIndex.of(
-                MarginalizedKeyframes(**_with_prefix(_MARGINALIZED, arrays)), dict(header["forgotten_up_to"])
+                MarginalizedKeyframes(**_with_prefix(_MARGINALIZED, arrays)), _forgotten(header)
             ),
             revision=header["revision"],
             **{name: arrays[name] for name in _KEYFRAME_COLUMNS},
         )
     )
+
+
+def _forgotten(header: dict[str, Any]) -> Forgotten:
+    ids = dict(header["forgotten_up_to"])
+    # Files of before do not have the stamps; there a keyframe that was named by its stamp had that for its id.
+    rows = header.get("forgotten_stamps", [[robot, 0, keyframe_id] for robot, keyframe_id in ids.items()])
+    return Forgotten(ids, {(robot, time_line): stamp_ns for robot, time_line, stamp_ns in rows})
 
 
 def _pending(rows: list[dict[str, Any]], options: EstimatorOptions) -> PendingEdges:

@@ -17,7 +17,7 @@ from rotavg_ros.evaluation.common.cases import drawings
 from rotavg_ros.evaluation.slam import stress
 from rotavg_ros.odometry_route import ROUTE_COLUMNS
 from rotavg_ros.online.compaction.marginalization import Columns, are_between, is_plain_odometry, marginalize
-from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
+from rotavg_ros.online.compaction.marginalized_keyframes import Forgotten, MarginalizedIndex, MarginalizedKeyframes
 from rotavg_ros.solver import solve
 from rotavg_ros.view_graph import ViewGraph
 
@@ -113,7 +113,7 @@ def test_what_is_left_is_the_schur_complement_and_true_to_the_poses(drive, seed)
     np.testing.assert_allclose(edges["translation"], steps, atol=1e-7)
 
     assert sorted(riders.keyframe_id.tolist()) == gone.tolist()
-    index = MarginalizedIndex.of(riders, {})
+    index = MarginalizedIndex.of(riders, Forgotten())
     for keyframe in gone.tolist():
         row = index.by_id(0, keyframe)
         assert row == index.by_moment(0, 0, 10 * keyframe) and index.by_id(1, keyframe) is None

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator, RejectReason
+from rotavg_ros.online.graph import room
 from rotavg_ros.view_graph import EdgeKind
 
 SECOND = 1_000_000_000
@@ -146,6 +147,36 @@ def test_keyframes_that_a_front_end_names_by_stamps_alone_are_others_on_each_tim
     assert answer.num_components == 3 and len(answer.keyframe_id) + counts.marginalized == 18
     assert set(answer.time_line.tolist()) == {0, 1, 2} and (counts.marginalized > 0) == (max_keyframes < 18)
     assert counts.rejected == {"duplicate_edge": 15}
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_forgotten_keyframes_of_another_time_line_keep_none_from_being_made(
+    solver, restart: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Their stamps serve as ids, and after the clock went back all stamps are lower: nothing was added any more."""
+    monkeypatch.setattr(room, "_REMEMBERED", 1)
+    monkeypatch.setattr(room, "_REMEMBERED_AT_LEAST", 0)
+    options = EstimatorOptions(keyframe_source="edges", max_keyframes=12)
+    online = OnlineEstimator(options, solver)
+
+    def drive(length: int) -> list[RejectReason | None]:
+        feed(online, range(length))
+        moments = range(0, length * SECOND // 10 - SECOND, SECOND)
+        steps = (closure(number, moment, moment + SECOND) for number, moment in enumerate(moments))
+        return [online.add_edge(replace(step, kind=EdgeKind.ODOMETRY)) for step in steps]
+
+    assert drive(400) == [None] * 39
+    assert online.snapshot().marginalized.forgotten.stamps_ns[0, 0] > 10 * SECOND
+    if restart:
+        online.save(tmp_path / "state.npz")
+        online = OnlineEstimator(options, solver)
+        online.load(tmp_path / "state.npz")
+    again = replace(closure(1000, 2 * SECOND, 3 * SECOND), kind=EdgeKind.ODOMETRY)
+    assert online.add_edge(again) is not None, "those of the same time line stay forgotten"
+    assert drive(LENGTH) == [None] * 5
+    snapshot = online.snapshot()
+    made = np.concatenate((snapshot.time_line, snapshot.marginalized.keyframes.time_line))
+    assert int((made == 1).sum()) == 6 and online.counts().keyframes <= 12
 
 
 def test_a_stamp_that_the_present_time_line_does_not_cover_means_an_earlier_one(kept) -> None:
