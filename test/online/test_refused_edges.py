@@ -131,17 +131,28 @@ def test_a_front_end_that_counts_from_zero_again_is_told_by_its_odometry(solver,
     assert estimator.counts().edges == edges + (not is_refused)
 
 
-@pytest.mark.parametrize("same_ns", [True, False])
-@pytest.mark.parametrize("which", ["source", "target"])
-def test_a_second_odometry_between_the_same_keyframes_is_another_measurement(solver, same_ns, which):
-    """Of two that differ the solver finds the wrong one; before, the one that came first was all it saw. Keyframes of
-    the same ids and other stamps are others: their front end has begun anew."""
+@pytest.mark.parametrize("turned_deg", [0.5, 30.0])
+@pytest.mark.parametrize(
+    ("later_ns", "is_refused"),
+    [
+        ((0, 0), {0.5: False, 30.0: False}),  # another measurement between the same keyframes
+        ((9 * SECOND, 9 * SECOND), {0.5: True, 30.0: True}),  # other keyframes of the same ids
+        ((0, 9 * SECOND), {0.5: False, 30.0: True}),  # unclear: the rotation decides
+        ((None, 9 * SECOND), {0.5: False, 30.0: True}),
+    ],
+)
+def test_stamps_tell_a_second_odometry_from_a_front_end_that_has_begun_anew(solver, turned_deg, later_ns, is_refused):
+    """Of two measurements the solver finds the wrong one; before, the one that came first was all it saw. A robot that
+    begins anew and drives straight on turns as it did before."""
     estimator = make(solver, replace(OPTIONS, keyframe_source="edges"))
-    ends = {"source": KeyframeReference("r", 0, 5 * SECOND), "target": KeyframeReference("r", 1, 6 * SECOND)}
-    first = EdgeMeasurement(0, **ends, target_from_source=(0, 0, 0, 1), kind=EdgeKind.ODOMETRY)
-    moved = ends | {which: replace(ends[which], stamp_ns=ends[which].stamp_ns + (not same_ns))}
-    turned = tuple(Rotation.from_euler("z", 30, degrees=True).as_quat())
-    other = EdgeMeasurement(1, **moved, target_from_source=turned, kind=EdgeKind.ODOMETRY)
-    assert estimator.add_edge(first) is None
-    assert estimator.add_edge(other) == (None if same_ns else "contradictory_odometry")
-    assert estimator.counts().edges == 1 + same_ns
+    stamps_ns = 5 * SECOND, 6 * SECOND
+    ends = [KeyframeReference("r", number, stamp_ns) for number, stamp_ns in enumerate(stamps_ns)]
+    again = [
+        KeyframeReference("r", number, None if later is None else stamp_ns + later)
+        for number, (stamp_ns, later) in enumerate(zip(stamps_ns, later_ns, strict=True))
+    ]
+    turned = tuple(Rotation.from_euler("z", turned_deg, degrees=True).as_quat())
+    assert estimator.add_edge(EdgeMeasurement(0, *ends, (0, 0, 0, 1), EdgeKind.ODOMETRY)) is None
+    said = estimator.add_edge(EdgeMeasurement(1, *again, turned, EdgeKind.ODOMETRY))
+    assert said == ("contradictory_odometry" if is_refused[turned_deg] else None)
+    assert estimator.counts().edges == 2 - is_refused[turned_deg]

@@ -97,11 +97,12 @@ class EdgePlacement:
     def _check_repeated_odometry(self, edge: EdgeMeasurement) -> None:
         """Refuse odometry of a front end that has begun anew and uses the same ids for other places.
 
-        Where both ends state the moments that the graph has for their keyframes, they are the same keyframes. However
+        Both ends then state other stamps than the graph's keyframes have; or, where they state none, the rotation
+        differs much. Where both state the stamps of the graph's keyframes, they are the same keyframes. However
         different, the rotation is then another measurement, as of a second odometry, and the solver judges both.
 
         Raises:
-            RejectedInputError: the graph has very different odometry between these keyframes.
+            RejectedInputError: the graph has other odometry between keyframes of these ids.
         """
         source, target = edge.source, edge.target
         chosen_by_front_end = self._growth.options.keyframe_source == "edges" and edge.kind == EdgeKind.ODOMETRY
@@ -109,19 +110,26 @@ class EdgePlacement:
             return
         ends = (source.robot, source.keyframe_id), (target.robot, target.keyframe_id)
         known = self._growth.graph.odometry_between(*ends)
-        if known is None or not contradict(known, edge.target_from_source):
+        if known is None:
             return
-        if not all(map(self._states_its_moment, (source, target))):
+        are_meant = {self._is_meant(source), self._is_meant(target)}
+        is_anew = are_meant == {False} or (are_meant != {True} and contradict(known, edge.target_from_source))
+        if is_anew:
             raise RejectedInputError(RejectReason.CONTRADICTORY_ODOMETRY)
 
-    def _states_its_moment(self, end: KeyframeReference) -> bool:
-        """Whether an end by id has the stamp, and is on the time line, of the graph's keyframe with this id."""
+    def _is_meant(self, end: KeyframeReference) -> bool | None:
+        """Whether an end by id states the moment of the graph's keyframe with this id; None: nobody knows."""
         growth = self._growth
         assert end.keyframe_id is not None
         node = growth.graph.node(end.robot, end.keyframe_id)
         if node is None or end.stamp_ns is None:
+            return None
+        stamp_ns, time_line = growth.graph.moment_of(node)
+        if stamp_ns == UNKNOWN_STAMP_NS:
+            return None
+        if abs(end.stamp_ns - stamp_ns) > growth.options.odometry_bounds.tolerance_ns:
             return False
-        return growth.graph.moment_of(node) == (end.stamp_ns, growth.time_line_of(end.robot, end.stamp_ns))
+        return True if growth.time_line_of(end.robot, end.stamp_ns) == time_line else None
 
     def _undecided_end(self, edge: EdgeMeasurement) -> KeyframeReference | None:
         """The first end whose stamp matters and may belong to either of two time lines."""
