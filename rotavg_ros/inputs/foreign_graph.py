@@ -48,11 +48,18 @@ class ForeignGraph:
         self._num_losses += 1
         self._loss[ends_of(source, target)] = self._num_losses
 
-    def _note_stamp(self, key: Key, stamp_ns: int) -> None:
-        """Remember when a keyframe was taken; 0 means that the sender does not say."""
+    def _note_stamp(self, key: Key, stamp_ns: int, *, is_its_own: bool = True) -> None:
+        """Remember when a keyframe was taken.
+
+        Args:
+            key: the keyframe.
+            stamp_ns: 0 means that the sender does not say.
+            is_its_own: whether the sender states it of this keyframe. Another one then means another keyframe, since
+                the sender has begun anew; else the first counts.
+        """
         if stamp_ns > 0:
             _make_room(self._stamp_ns)
-            self._stamp_ns.setdefault(key, stamp_ns)
+            self._stamp_ns[key] = stamp_ns if is_its_own else self._stamp_ns.get(key, stamp_ns)
 
     def _edges(
         self, ends: tuple[Key, Key], rotation: Any, translation: Any, kind: int, precision: float

@@ -44,7 +44,7 @@ class MapGraphConverter(ForeignGraph):
             return
         if len(message.poses_id):
             # The newest node is the frame that the message was published for.
-            self._note_stamp((robot, int(max(message.poses_id))), stamp_ns)
+            self._note_stamp((robot, int(max(message.poses_id))), stamp_ns, is_its_own=False)
         links, unknown = edges_in_order(message.links, _KIND, _NO_EDGES)
         for link in links:
             yield from self._edges(

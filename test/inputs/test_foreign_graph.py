@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.inputs import EDGE_CONVERTERS, EdgeVerdict, Source, foreign_graph
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, OnlineEstimator, RejectReason
-from rotavg_ros.view_graph import EdgeLabel
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
 from .square import (
     BODY_FROM_SENSOR,
@@ -81,6 +81,24 @@ def test_odometry_that_contradicts_the_graph_is_refused_whoever_told_of_it(
         assert online.add_edge(record.edge) is (RejectReason.DUPLICATE_EDGE if turned_deg == 0 else None)
     assert online.snapshot().graph.num_edges == before.num_edges + (turned_deg == 3)
     assert online.odometry_between(("b", 1), ("b", 0)) is online.odometry_between(("b", 0), ("b", 7)) is None
+
+
+@pytest.mark.parametrize("later_s", [0, 1000])
+def test_a_sender_that_begins_anew_is_told_by_its_keyframes_stamps(later_s: int) -> None:
+    """Its robot turns as it did before, but for two degrees: a refinement, or steps of another drive."""
+    online, convert = Reader().online, converter("pose_graph_tools_msgs/msg/PoseGraph")
+
+    def said(graph: Fields) -> list[object]:
+        records = [record.edge for record in convert(graph)]
+        return [online.add_edge(edge) for edge in records if edge.kind == EdgeKind.ODOMETRY]
+
+    assert said(pose_graph(1)) == [None] * 3
+    again, turn = pose_graph(1), Rotation.from_euler("y", 2.0, degrees=True)
+    for node in again.nodes:
+        node.header.stamp.sec += later_s
+    for key, edge in enumerate(again.edges[1:]):
+        edge.pose.orientation = quaternion(world_from_sensor(key).inv() * world_from_sensor(key + 1) * turn)
+    assert said(again) == [RejectReason.CONTRADICTORY_ODOMETRY if later_s else None] * 3
 
 
 def test_a_senders_verdict_on_a_closure() -> None:
