@@ -9,6 +9,7 @@ from collections.abc import Collection
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from rotavg_ros.online.content import Counts
+from rotavg_ros.online.measurements import RejectReason
 from rotavg_ros.ros.node.health import Health
 from rotavg_ros.settings.parameters import NodeParameters
 from rotavg_ros.version import __version__
@@ -30,6 +31,10 @@ TIME_WENT_BACK = {
 KEPT = "what was forgotten or replaced is kept in"
 NOT_KEPT = "what was forgotten or replaced could not be backed up:"
 OTHER_ROBOTS = "the state file is of robots that are not named in robots"
+BEGAN_ANEW = (
+    "a front end sends other odometry between keyframes whose ids the graph has: if it was started again, none of what "
+    "it sends now is about the robot's present way; call ~/reset"
+)
 # Refusals that occur in a healthy system, where senders repeat themselves.
 _HARMLESS = {"duplicate_edge", "marginalized_keyframe"}
 
@@ -40,7 +45,7 @@ class Reporter:
     def __init__(self, name: str) -> None:
         self._name = name
         self._lost = 0
-        self._dropped = 0
+        self._dropped: dict[str, int] = {}
         self._odometry_received = 0
         self._restarts = 0
         self._reported = time.monotonic()
@@ -53,7 +58,11 @@ class Reporter:
         rate = (received - self._odometry_received) / max(now - self._reported, 1e-3)
         values["odometry rate hz"] = f"{rate:.1f}"
         values["latest ticks ms"] = " ".join(f"{tick:.1f}" for tick in health.ticks.between_ms(self._reported, now))
-        dropped = sum(count for reason, count in counts.rejected.items() if reason not in _HARMLESS)
+        dropped = {reason: count for reason, count in counts.rejected.items() if reason not in _HARMLESS}
+        new = {reason: count - self._dropped.get(reason, 0) for reason, count in dropped.items()}
+        new = {reason: count for reason, count in new.items() if count > 0}
+        if RejectReason.CONTRADICTORY_ODOMETRY.value in new:
+            health.note(BEGAN_ANEW)
         errors = _errors(health, parameters, paused, now)
         if counts.time_is_back:
             errors.append("time went back and odometry is refused since; call ~/reset to begin anew")
@@ -67,8 +76,8 @@ class Reporter:
         if counts.odometry_restarts > self._restarts:
             warnings.append("odometry began anew: a component more until a closure joins it")
         self._restarts = counts.odometry_restarts
-        if dropped > self._dropped:
-            warnings.append(f"{dropped - self._dropped} inputs refused")
+        if new:
+            warnings.append(f"{sum(new.values())} inputs refused ({', '.join(sorted(new))})")
         self._lost, self._dropped, self._odometry_received, self._reported = health.lost, dropped, received, now
         level = DiagnosticStatus.ERROR if errors else DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
         return DiagnosticStatus(

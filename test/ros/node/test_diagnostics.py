@@ -12,7 +12,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` instal
 
 from rotavg_ros.online import KeyframeReference
 from rotavg_ros.online.content import Counts
-from rotavg_ros.ros.node.diagnostics import Reporter
+from rotavg_ros.ros.node.diagnostics import BEGAN_ANEW, Reporter
 from rotavg_ros.ros.node.health import Health
 from rotavg_ros.ros.node.message_counting import TopicCounter
 from rotavg_ros.settings.parameters import NodeParameters
@@ -134,10 +134,25 @@ def test_closures_that_will_not_be_sent_on_are_counted(health: Health) -> None:
 def test_slow_solves_losses_and_refusals_warn(health: Health) -> None:
     health.ticks.add(20.0)
     assert "longer" in report(health).message
-    assert "2 inputs refused" in report(health, nan_rotation=2).message
+    refused = report(health, nan_rotation=2, odometry_gap=1, duplicate_edge=5).message
+    assert "3 inputs refused (nan_rotation, odometry_gap)" in refused
     for number in (1, 4):
         health.odometry["/odom"].by_sequence.observe("", number)
     assert "2 messages lost" in report(health).message
+
+
+def test_a_front_end_that_has_begun_anew_is_told_of_for_a_minute(health: Health) -> None:
+    """Each of its refusals passes in a second, and what to do is not in their counts."""
+    reporter = Reporter("rotavg: estimator")
+
+    def message(**rejected: int) -> str:
+        return str(reporter.report(health, Counts(10, 12, 0, rejected), NodeParameters(), False).message)
+
+    assert "front end" not in message(nan_rotation=1)
+    assert "call ~/reset" in message(nan_rotation=1, contradictory_odometry=1)
+    assert message(nan_rotation=1, contradictory_odometry=1) == BEGAN_ANEW
+    health.notices = {text: noted - 61 for text, noted in health.notices.items()}
+    assert message(nan_rotation=1, contradictory_odometry=1) == "ok"
 
 
 def test_a_graph_without_odometry_does_not_miss_it(health: Health) -> None:
