@@ -95,7 +95,7 @@ def test_what_a_run_has_in_common_is_what_all_other_rows_say(seed: int) -> None:
     problem, solved = pose.problem, pose.solved
     d, num_edges = problem.turns + problem.shifts, len(problem.drawn.source)
     turn_weight, state = solved.rotation_weight, pose.state
-    root = problem.whitening(solved.covariance, turn_weight, solved.closure_weight, state)
+    root = problem.whitening(solved.covariance, turn_weight, solved.closure_root, state)
     rows = np.matmul(root, problem.jacobian(solved.way))
     place = problem.equations.block
     dense = np.zeros((len(rows), d, problem.equations.num_blocks, d))
