@@ -67,18 +67,18 @@ class Predictions:
         root = np.sqrt(share)
         return Predictions(share * self.mean, root[:, :, None] * self.covariance * root[:, None, :])
 
-    def square_length(self, stated: np.ndarray, own: np.ndarray) -> np.ndarray:
+    def square_length(self, stated: np.ndarray, own: np.ndarray | None = None) -> np.ndarray:
         """``(C,)`` m², expected squared lengths of closures, given what each states and the predictions by all else.
 
         The length that one states will not do: where its error is larger than its length, it would explain itself.
 
         Args:
             stated: ``(C, m)`` metres, stated shifts in the axes of the predictions.
-            own: ``(C,)`` m² per component, variance of each as a good closure.
+            own: ``(C,)`` m² per component, variance of each as a good closure; None: given the predictions alone.
         """
         turns = self.mean.shape[1] - stated.shape[1]
         spread = np.trace(self.covariance[:, turns:, turns:], axis1=1, axis2=2) / stated.shape[1]
-        share = own / (own + spread)
+        share = np.ones(len(spread)) if own is None else own / (own + spread)
         between = stated - share[:, None] * self.mean[:, turns:]
         return np.asarray((between**2).sum(axis=1) + stated.shape[1] * share * spread)
 
@@ -152,13 +152,15 @@ class Places:
         chance: ``(J + 1, C)`` probability of each class; the last is a false rotation.
         weight: ``(C,)`` m⁻², weight of each translation.
         rotation_weight: ``(C,)`` rad⁻², likewise.
-        squares, freedom: ``(3,)`` sums over good closures, in units of the respective variances: of their turns, of
-            their translations independent of length, and of the part proportional to length.
+        squares, freedom: ``(2,)`` sums over good closures, in units of the respective variances: of their turns, and of
+            their translations' errors that are independent of length.
         log_density: ``(C,)`` nats, of each closure, summed over its classes.
         error, error_variance: ``(J + 1, C)`` m and m² per component, of ε in each class (the last: a false rotation):
             length of its mean, and variance.
         even: ``(C, m, m)`` from shifts to the even ones that ``weight`` weighs.
-        along_body: ``(2, m, m)`` squares and freedom of good closures' even shifts in the body's axes.
+        along_body: ``(2, m, m)`` squares and freedom of the latter in the body's axes.
+        pulled: ``(2, C)`` m⁻², squares and freedom of each one's translation as a good closure, divided by its squared
+            variance and by its variance.
     """
 
     chance: np.ndarray
@@ -171,6 +173,7 @@ class Places:
     error_variance: np.ndarray
     even: np.ndarray
     along_body: np.ndarray
+    pulled: np.ndarray
 
     @property
     def closure_root(self) -> np.ndarray:
@@ -208,6 +211,7 @@ class Scale:
         extent: variance of the distance between two places of the map.
         anywhere: ``(C,)`` variance of a wrong closure: to any place of the map, or as far as it states.
         square_length: ``(C,)`` m², expected squared length of each, not per component.
+        least_square: ``(C,)`` m², that or, where it is less, what all else alone lets expect.
         shape: shifts in units in which good closures err alike along all axes.
     """
 
@@ -217,6 +221,7 @@ class Scale:
     extent: float
     anywhere: np.ndarray
     square_length: np.ndarray
+    least_square: np.ndarray
     shape: EvenShifts
 
     @cached_property

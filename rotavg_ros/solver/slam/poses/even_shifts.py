@@ -25,19 +25,21 @@ class EvenShifts:
         even: ``(C, m, m)`` from shifts to even ones.
         uneven: ``(C, m, m)`` back.
         frame: ``(C, m, m)`` from the body's axes in which the shape is stated to those of shifts.
-        size: ``(C,)`` variance of an even shift, if that of a shift is 1 in the mean over the shape's axes.
+        size: ``(C,)`` variance of an even shift, if that of a shift is 1 in the geometric mean over the shape's axes.
+        shape: ``(m, m)`` in the body's axes.
     """
 
     even: np.ndarray
     uneven: np.ndarray
     frame: np.ndarray
     size: np.ndarray
+    shape: np.ndarray
 
     @classmethod
     def alike(cls, count: int, shifts: int) -> EvenShifts:
         """All axes are alike: even shifts are the shifts."""
         unit = np.tile(np.eye(shifts), (count, 1, 1))
-        return cls(unit, unit, unit, np.ones(count))
+        return cls(unit, unit, unit, np.ones(count), np.eye(shifts))
 
     @classmethod
     def of(cls, shape: np.ndarray, frame: np.ndarray, share: np.ndarray) -> EvenShifts:
@@ -50,7 +52,7 @@ class EvenShifts:
         size = np.exp(np.log(variance).mean(axis=1))
         root = np.sqrt(variance / size[:, None])[:, None]
         back = axes.transpose(0, 2, 1)
-        return cls((axes / root) @ back, (axes * root) @ back, frame, size)
+        return cls((axes / root) @ back, (axes * root) @ back, frame, size, shape)
 
 
 def likeliest_shape(shape: np.ndarray, squares: np.ndarray, freedom: np.ndarray) -> np.ndarray:
@@ -58,14 +60,16 @@ def likeliest_shape(shape: np.ndarray, squares: np.ndarray, freedom: np.ndarray)
 
     Args:
         shape: ``(m, m)`` before.
-        squares, freedom: ``(m, m)`` in the body's axes, of what has the shape: sum of squares of whitened shifts, times
-            their whitening, and what is expected of it, in units of what its variance is in the mean over axes.
+        squares, freedom: ``(m, m)`` in the body's axes: sums of Σ⁻¹ x xᵀ Σ⁻¹ and of Σ⁻¹, with shifts x of covariance Σ,
+            each times the variance of what has the shape.
     """
     root = _power(shape, 0.5)
     squares, freedom = root @ squares @ root, root @ freedom @ root
-    alone = _power(freedom + np.finfo(np.float64).tiny * np.eye(len(shape)), -0.5)
     count = float(np.trace(freedom)) / len(shape)
-    found = count * root @ alone @ squares @ alone @ root + _ALIKE * np.eye(len(shape))
+    least = np.finfo(np.float64).eps * count + np.finfo(np.float64).tiny
+    alone = root @ _power(freedom + least * np.eye(len(shape)), -0.5)
+    found = count * alone @ squares @ alone.T + _ALIKE * np.eye(len(shape))
+    found = (found + found.T) / 2
     return np.asarray(found / np.linalg.det(found) ** (1 / len(shape)))
 
 

@@ -100,10 +100,10 @@ class PoseProblem:
         if self.mode.problem.components == 3:
             return np.eye(3), np.eye(3)
         vectors = rotations.log(self.graph.target_from_source).numpy()
-        axes = np.linalg.eigh(vectors.T @ vectors)[1]
-        off = np.abs(self.lengths @ axes[:, 2]).max(initial=0.0)
+        normal = np.linalg.eigh(vectors.T @ vectors)[1][:, 2]
+        off = np.abs(self.lengths @ normal).max(initial=0.0)
         is_planar = off <= _PLANAR * np.abs(self.lengths).max(initial=0.0)
-        return axes[:, 2:], axes[:, :2] if is_planar else np.eye(3)
+        return normal[:, None], _across(normal) if is_planar else np.eye(3)
 
     @cached_property
     def drift_axis(self) -> np.ndarray | None:
@@ -300,6 +300,11 @@ class PoseProblem:
         """``(C,)`` m², squared lengths that closures state."""
         return np.asarray((self.lengths[self.closures] ** 2).sum(axis=1))
 
+    def stated_variance(self, state: PoseState) -> np.ndarray:
+        """``(C,)`` m² per component, mean over axes, of good closures that are as long as they state."""
+        noise = state.noise.of_constant_times(self.mean_closure_shift(state.shape))
+        return noise.of_closures(self.stated_square)
+
     def own_variance(self, noise: PoseNoise, square_length: np.ndarray) -> np.ndarray:
         """``(C,)`` m² per component, the part of good closures' variance that they do not share with their runs.
 
@@ -312,7 +317,8 @@ class PoseProblem:
 
     def even_shifts(self, state: PoseState, share: np.ndarray) -> EvenShifts:
         """Units in which closures' shifts err alike along all axes; a share ``(C,)`` of their variances has a shape."""
-        older = np.minimum(self.graph.source.numpy(), self.graph.target.numpy())[self.closures]
+        drawn, closure = self.drawn, self.mode.problem.closure
+        older = drawn.nodes[np.where(drawn.is_forward[closure], drawn.source[closure], drawn.target[closure])]
         body_from_world = np.ascontiguousarray(self.orientations(state)[older].T)
         frame = self.bases[1].T @ quaternion_rows.matrices(quaternion_rows.inverse(body_from_world)) @ self.bases[1]
         return EvenShifts.of(self.bases[1].T @ state.shape @ self.bases[1], frame, share)
@@ -494,3 +500,12 @@ class PoseProblem:
         shift = max(1 / state.noise.step, 1 / state.noise.closure)
         tied = np.full(self.turns, float(rotation_weight.max())), np.full(self.shifts, shift)
         return _GROUNDING * np.concatenate(tied)
+
+
+def _across(normal: np.ndarray) -> np.ndarray:
+    """``(3, 2)`` axes of the plane across a unit vector ``(3,)``: the same ones for nearly the same plane."""
+    normal = normal * np.sign(normal[np.argmax(np.abs(normal))])
+    first = np.eye(3)[np.argmin(np.abs(normal))]
+    first = first - (first @ normal) * normal
+    first /= np.linalg.norm(first)
+    return np.stack((first, np.cross(normal, first)), axis=1)

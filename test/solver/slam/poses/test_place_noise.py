@@ -135,6 +135,7 @@ def test_before_any_solve_as_many_places_may_be_wrong_as_is_believed_beforehand(
         100.0,
         np.full(count, 100.0),
         np.zeros(count),
+        np.zeros(count),
         EvenShifts.alike(count, 2),
     )
     places = judge.nothing_known(np.ones(count, dtype=bool), np.zeros(count), scale)

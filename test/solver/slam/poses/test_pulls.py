@@ -43,6 +43,7 @@ def said_of(count: int, off: float) -> Said:
         2500.0,
         np.full(count, 2500.0),
         np.zeros(count),
+        np.zeros(count),
         EvenShifts.alike(count, 2),
     )
     return Said.of(Predictions(mean, covariance), told(count), 1, scale, PlacePriors())

@@ -149,13 +149,15 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     spend(_ROW * len(jacobian))
     predictions = _left_out(factor, root, left, closure).within(k, ANYHOW, anywhere)
     stated = state.noise.of_closures(problem.stated_square)
-    square_length = problem.stated_square
+    square_length = least_square = problem.stated_square
     if "expected-lengths" not in problem.mode.problem.without:
-        square_length = predictions.square_length(way.displacement[closure] @ shifts, stated)
-    scale = _scale(problem, state, square_length)
+        told = way.displacement[closure] @ shifts
+        square_length = predictions.square_length(told, stated)
+        least_square = np.minimum(square_length, predictions.square_length(told))
+    scale = replace(_scale(problem, state, square_length), least_square=least_square)
     judge = replace(judge, told=replace(judge.told, rotation_variance=turn_variances[closure, 0]))
     spend(_ROW * len(jacobian))
-    maps = MapTurns.of(problem, state.position, predictions, stated)
+    maps = MapTurns.of(problem, state.position, predictions, problem.stated_variance(state))
     spend(_ROW * len(jacobian))
     judged = judge(predictions, maps, places.chance, scale)
     return Solved(
@@ -219,7 +221,7 @@ def _scale(problem: PoseProblem, state: PoseState, square_length: np.ndarray) ->
     share = state.noise.closure / own
     shape = problem.even_shifts(state, share)
     good = state.noise.of_closures(square_length) + (shape.size - 1) * own
-    return Scale(good, shape.size * own, share, extent, anywhere, square_length, shape)
+    return Scale(good, shape.size * own, share, extent, anywhere, square_length, square_length, shape)
 
 
 def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.ndarray) -> Predictions:

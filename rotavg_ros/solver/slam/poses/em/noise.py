@@ -14,9 +14,9 @@ from rotavg_ros.solver.slam.poses.solved import Solved
 from rotavg_ros.solver.slam.poses.state import PoseNoise
 from rotavg_ros.solver.slam.posterior.em import likeliest_variance
 
-# Variances that are estimated each by itself; those of odometry's shifts, which are estimated together, by how many
-# steps at most, and the change that ends them.
-_ALONE, _OF_SHIFTS = np.array([0, 1, 3, 4, 5, 7]), np.array([2, 6])
+# Variances that are estimated each by itself; those of odometry's shifts, which are estimated together, and that which
+# grows with closures' lengths: by how many steps at most, and the change that ends them.
+_ALONE, _OF_SHIFTS, _GROWS = np.array([0, 1, 3, 5, 7]), np.array([2, 6]), [4]
 _SCORING_STEPS, _SCORED = 20, 1e-3
 # Each variance's own prior: median and standard deviation of the logarithm of its root.
 _Prior = tuple[float, float]
@@ -63,6 +63,7 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     free = _OF_SHIFTS[: 2 if problem.steps_err else 1]
     travelled = solved.way.travelled[segments, : len(free)]
     logarithms[free] = _likeliest_parts(told, total, travelled, logarithms[free], [priors[each] for each in free])
+    logarithms[_GROWS] = _likeliest_growth(problem, solved, priors[_GROWS[0]])
     noise = PoseNoise.of(logarithms)
     if problem.drift_axis is None or noise.tilt > noise.turn:
         # A larger variance of tilts is not allowed: it would make room for false closures.
@@ -77,6 +78,19 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     return replace(noise, common=common, way=within * noise.way, step=within * noise.step, tilt=tilt)
 
 
+def _likeliest_growth(problem: PoseProblem, solved: Solved, prior: _Prior) -> np.ndarray:
+    """``(1,)`` logarithm of the growth of closures' variance with the squared length.
+
+    Where that is a small part of the variance its freedom is in proportion to it, so its own squares and freedom would
+    not tell where it ends. A length that a closure's own error makes longer would explain that error.
+    """
+    scale, (squares, freedom) = solved.scale, solved.places.pulled
+    shaped = scale.floor_share * (problem.mean_closure_shift(solved.state.shape) - 1)
+    total = scale.own / scale.shape.size * (1 + shaped)
+    told, before = (squares * total**2, freedom * total), solved.state.noise.logarithms[_GROWS]
+    return _likeliest_parts(told, total, scale.least_square[:, None], before, [prior])
+
+
 def _likeliest_parts(
     told: tuple[np.ndarray, np.ndarray],
     total: np.ndarray,
@@ -84,16 +98,16 @@ def _likeliest_parts(
     before: np.ndarray,
     priors: Sequence[_Prior],
 ) -> np.ndarray:
-    """``(n,)`` logarithms of the variances per metre, and per step unless that is fixed, together, by Fisher scoring.
+    """``(n,)`` logarithms of the variances per unit of each part, together, by Fisher scoring.
 
     One by one, variances of which one can stand for the other would creep. Each segment's squares S and freedom n count
     as those of its own variance V, −n/2 log V − S/(2 V), whose slope at the variances before is that of the restricted
     likelihood.
 
     Args:
-        told: squares and freedom of S segments, ``(S,)`` each.
+        told: squares and freedom of S segments, or closures, ``(S,)`` each.
         total: ``(S,)`` m², their variances.
-        travelled: ``(S, n)`` metres, and steps.
+        travelled: ``(S, n)`` units of each part: metres, and steps; or squared lengths.
         before: ``(n,)`` logarithms of the variances before.
         priors: of these.
     """

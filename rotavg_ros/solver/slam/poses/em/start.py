@@ -50,7 +50,8 @@ class PoseStart:
         closure, noise = problem.mode.problem.closure, pose.state.noise
         is_same = problem.mode.state.is_good[closure] == pose.problem.mode.state.is_good[closure]
         column = np.where(is_same, np.arange(len(closure)), -1)
-        return cls(replace(along_odometry(problem), noise=noise), column, pose.solved.places, MAX_SOLVES)
+        state = replace(along_odometry(problem), noise=noise, shape=pose.state.shape)
+        return cls(state, column, pose.solved.places, MAX_SOLVES)
 
     @classmethod
     def believing(cls, pose: PoseMode, closures: np.ndarray) -> PoseStart:
@@ -103,9 +104,11 @@ class PoseStart:
         is_known = edge < kept.shape[1]
         is_known[is_known] &= ~np.isnan(kept[:, edge[is_known]]).any(axis=0)
         chance, (weight, rotation_weight) = np.split(kept[:, edge[is_known]].astype(np.float64), [CLASSES])
-        none, zeros = np.zeros_like(chance), np.zeros(3)
+        none, zeros = np.zeros_like(chance), np.zeros(2)
         even, nothing = np.tile(np.eye(problem.shifts), (len(weight), 1, 1)), np.zeros((2, *[problem.shifts] * 2))
-        places = Places(chance, weight, rotation_weight, zeros, zeros, np.zeros(len(weight)), none, none, even, nothing)
+        places = Places(
+            chance, weight, rotation_weight, zeros, zeros, np.zeros(len(weight)), none, none, even, nothing, none[:2]
+        )
         column = np.where(is_known, np.cumsum(is_known) - 1, -1)
         state = replace(along_odometry(problem), noise=PoseNoise(*noise.tolist()))
         return cls(state, column, places, MAX_SOLVES)

@@ -24,20 +24,18 @@ def pulled(said: Said, told: Told, log_class: np.ndarray, number: np.ndarray) ->
     weight = np.where(known, _shift_weight(said, told, (log_class, chance), number), 0.0)
     square = (said.predictions.mean[:, k:] ** 2).sum(axis=1)
     turn_weight, turn_squares, turn_freedom = _of_turns(said, chance)
-    good = slice(GOOD)
-    at_good, total = chance[good, :, None] * known[:, None], said.total[good]
-    floor = np.stack((said.scale.floor_share, 1 - said.scale.floor_share))[:, None, :, None]
-    own, axes = said.variance[good, :, None] * floor, (1, 2, 3)
+    constant, along_body, pulled = _of_parts(said, chance[:GOOD] * known)
     return Places(
         chance,
         np.maximum(weight, _least_weight(square, said.scale)),
         turn_weight,
-        np.append(turn_squares, (at_good * own * said.along[good] ** 2 / total**2).sum(axis=axes)),
-        np.append(turn_freedom, (at_good * own / total).sum(axis=axes)),
+        np.array([turn_squares, constant[0]]),
+        np.array([turn_freedom, constant[1]]),
         log_density,
         *said.errors(),
         said.scale.shape.even,
-        _along_body(said, chance[good] * known),
+        along_body,
+        pulled,
     )
 
 
@@ -56,9 +54,9 @@ def nothing_known(told: Told, priors: PlacePriors, is_good: np.ndarray, square: 
     chance[0], chance[GOOD], chance[-1] = is_good * (1 - wrong), is_good * wrong, ~is_good
     turn = np.where(is_good, 1.0, NOTHING) / told.rotation_variance
     none = np.zeros_like(chance)
-    zeros = np.zeros(3), np.zeros(3), np.zeros(len(is_good))
-    even = scale.shape.even
-    return Places(chance, _least_weight(square, scale), turn, *zeros, none, none, even, np.zeros((2, *even.shape[1:])))
+    zeros, even = (np.zeros(2), np.zeros(2), np.zeros(len(is_good))), scale.shape.even
+    nothing = np.zeros((2, *even.shape[1:])), np.zeros((2, len(is_good)))
+    return Places(chance, _least_weight(square, scale), turn, *zeros, none, none, even, *nothing)
 
 
 def _shift_weight(said: Said, told: Told, classes: tuple[np.ndarray, np.ndarray], number: np.ndarray) -> np.ndarray:
@@ -79,21 +77,28 @@ def _shift_weight(said: Said, told: Told, classes: tuple[np.ndarray, np.ndarray]
     return np.asarray(pull / shrunk)
 
 
-def _along_body(said: Said, chance: np.ndarray) -> np.ndarray:
-    """``(2, m, m)`` squares and freedom of what has a shape (:func:`~even_shifts.likeliest_shape`).
+def _of_parts(said: Said, chance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Squares and freedom of good closures' errors, given the probabilities ``(2, C)`` of their classes.
 
-    Args:
-        said: densities in each class.
-        chance: ``(2, C)`` probabilities of both classes of good closures.
+    Returns:
+        ``(2,)`` of the constant part; ``(2, m, m)`` of this along the body's axes; ``(2, C)`` of each closure's whole
+        error, divided by its squared variance and by its variance.
     """
-    good, shape = slice(GOOD), said.scale.shape
-    shaped = said.scale.floor_share / shape.size
-    total, share = said.total[good], (chance * said.variance[good] * shaped)[:, :, None]
-    axes = np.matmul(np.matmul(shape.frame.transpose(0, 2, 1), shape.even), said.axes)
-    pulled = np.matmul(axes, (np.sqrt(share) * said.along[good] / total)[:, :, :, None])[:, :, :, 0]
-    pulled = pulled.reshape(-1, pulled.shape[2])
-    expected = (share / total).sum(axis=0)[:, None, :]
-    return np.stack((pulled.T @ pulled, np.matmul(axes * expected, axes.transpose(0, 2, 1)).sum(axis=0)))
+    scale, good = said.scale, slice(GOOD)
+    shape, total, weight = scale.shape, said.total[good], chance * said.variance[good] / scale.own
+    axes = np.matmul(shape.even, said.axes)
+    # Inverse covariances times shifts, and the inverses, weighted by classes.
+    pulled = np.matmul(axes, (np.sqrt(weight)[:, :, None] * said.along[good] / total)[:, :, :, None])[:, :, :, 0]
+    inverse = np.matmul(axes * (weight[:, :, None] / total).sum(axis=0)[:, None, :], axes.transpose(0, 2, 1))
+    constant = scale.own / shape.size * scale.floor_share
+    in_body = np.matmul(shape.frame.transpose(0, 2, 1), (np.sqrt(constant)[:, None] * pulled)[:, :, :, None])[
+        :, :, :, 0
+    ]
+    in_body = in_body.reshape(-1, in_body.shape[2])
+    expected = np.matmul(np.matmul(shape.frame.transpose(0, 2, 1), constant[:, None, None] * inverse), shape.frame)
+    along_body = np.stack((in_body.T @ in_body, expected.sum(axis=0)))
+    of_each = np.stack((over_components(pulled**2).sum(axis=0), np.trace(inverse, axis1=1, axis2=2)))
+    return (along_body * shape.shape).sum(axis=(1, 2)), along_body, of_each
 
 
 def _of_turns(said: Said, chance: np.ndarray) -> tuple[np.ndarray, float, float]:

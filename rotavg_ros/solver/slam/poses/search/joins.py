@@ -75,7 +75,7 @@ def other_joins(pose: PoseMode) -> list[Join]:
     sign = np.where(chain[could, 0] < chain[could, 1], 1.0, -1.0)
     shift = sign[:, None] * pose.solved.predictions.mean[could, k:]
     spread = np.diagonal(pose.solved.predictions.covariance[could][:, k:, k:], axis1=1, axis2=2).mean(axis=1)
-    variance = spread + pose.state.noise.of_closures(problem.stated_square[could])
+    variance = spread + problem.stated_variance(pose.state)[could]
     pair = np.sort(chain[could], axis=1)
     square = ((shift[:, None] - shift[None]) ** 2).sum(axis=2) / (variance[:, None] + variance[None])
     alike = (square < _ALIKE**2 * shift.shape[1]) & (pair[:, None] == pair[None]).all(axis=2)

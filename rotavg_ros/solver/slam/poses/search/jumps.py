@@ -181,7 +181,7 @@ class _Witnesses:
         problem, solved = pose.problem, pose.solved
         mode, told, drawn, k = problem.mode.problem, problem.told, problem.drawn, problem.turns
         here = given_turn(solved.predictions, told.rotation_variance, k)
-        own = pose.state.noise.of_closures(problem.stated_square)
+        own = problem.stated_variance(pose.state)
         total = here.spread + own[:, None]
         log_here = here.log_turn - np.log(2 * np.pi * total).sum(axis=1) / 2
         places = solved.places

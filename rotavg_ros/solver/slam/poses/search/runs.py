@@ -116,7 +116,7 @@ def _nearest(pose: PoseMode, could: np.ndarray) -> list[np.ndarray]:
     count = np.bincount(told.run, could)
     off = np.stack([np.bincount(told.run, could * told.sign * column) for column in predictions.mean.T], axis=1)
     spread = np.diagonal(predictions.covariance, axis1=1, axis2=2)
-    good = pose.state.noise.of_closures(pose.problem.stated_square)
+    good = pose.problem.stated_variance(pose.state)
     own = np.stack((told.rotation_variance, good), axis=1)
     total = spread + np.repeat(own, [k, spread.shape[1] - k], axis=1)
     variance = np.stack([np.bincount(told.run, could * column) for column in total.T], axis=1)
@@ -181,6 +181,7 @@ def _discrepancies(pose: PoseMode, members: np.ndarray) -> tuple[np.ndarray, np.
     problem, solved, k = pose.problem, pose.solved, pose.problem.turns
     rows, d = problem.mode.problem.closure[members], problem.turns + problem.shifts
     own = np.repeat(problem.closure_turns(pose.state.noise)[members, None], d, axis=1)
-    own[:, k:] = problem.own_variance(pose.state.noise, problem.stated_square)[members, None]
+    shared = np.where(problem.run[problem.mode.problem.closure] >= 0, pose.state.noise.common, 0.0)
+    own[:, k:] = (problem.stated_variance(pose.state) - shared)[members, None]
     total = solved.factor.covariance_between(problem.jacobian(solved.way)[rows], rows) + np.diag(own.ravel())
     return total, solved.predictions.mean[members].ravel()
