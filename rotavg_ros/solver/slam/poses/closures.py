@@ -67,20 +67,30 @@ class Predictions:
         root = np.sqrt(share)
         return Predictions(share * self.mean, root[:, :, None] * self.covariance * root[:, None, :])
 
-    def square_length(self, stated: np.ndarray, own: np.ndarray | None = None) -> np.ndarray:
+    def square_length(self, stated: np.ndarray, own: np.ndarray) -> np.ndarray:
         """``(C,)`` m², expected squared lengths of closures, given what each states and the predictions by all else.
 
         The length that one states will not do: where its error is larger than its length, it would explain itself.
 
         Args:
             stated: ``(C, m)`` metres, stated shifts in the axes of the predictions.
-            own: ``(C,)`` m² per component, variance of each as a good closure; None: given the predictions alone.
+            own: ``(C,)`` m² per component, variance of each as a good closure.
         """
         turns = self.mean.shape[1] - stated.shape[1]
         spread = np.trace(self.covariance[:, turns:, turns:], axis1=1, axis2=2) / stated.shape[1]
-        share = np.ones(len(spread)) if own is None else own / (own + spread)
+        share = own / (own + spread)
         between = stated - share[:, None] * self.mean[:, turns:]
         return np.asarray((between**2).sum(axis=1) + stated.shape[1] * share * spread)
+
+    def square_length_known(self, stated: np.ndarray) -> np.ndarray:
+        """``(C,)`` m², how much longer, squared, closures are by all else than its error would make them.
+
+        Args:
+            stated: ``(C, m)`` metres, stated shifts in the axes of the predictions.
+        """
+        turns = self.mean.shape[1] - stated.shape[1]
+        spread = np.trace(self.covariance[:, turns:, turns:], axis1=1, axis2=2)
+        return np.asarray(np.maximum(((stated - self.mean[:, turns:]) ** 2).sum(axis=1) - spread, 0.0))
 
     def even(self, shifts: np.ndarray) -> Predictions:
         """The predictions of even shifts, given the maps ``(C, m, m)`` from shifts to these."""
@@ -211,7 +221,7 @@ class Scale:
         extent: variance of the distance between two places of the map.
         anywhere: ``(C,)`` variance of a wrong closure: to any place of the map, or as far as it states.
         square_length: ``(C,)`` m², expected squared length of each, not per component.
-        least_square: ``(C,)`` m², that or, where it is less, what all else alone lets expect.
+        known_square: ``(C,)`` m², what of that all else knows.
         shape: shifts in units in which good closures err alike along all axes.
     """
 
@@ -221,7 +231,7 @@ class Scale:
     extent: float
     anywhere: np.ndarray
     square_length: np.ndarray
-    least_square: np.ndarray
+    known_square: np.ndarray
     shape: EvenShifts
 
     @cached_property

@@ -149,12 +149,12 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     spend(_ROW * len(jacobian))
     predictions = _left_out(factor, root, left, closure).within(k, ANYHOW, anywhere)
     stated = state.noise.of_closures(problem.stated_square)
-    square_length = least_square = problem.stated_square
+    square_length = known_square = problem.stated_square
     if "expected-lengths" not in problem.mode.problem.without:
         told = way.displacement[closure] @ shifts
         square_length = predictions.square_length(told, stated)
-        least_square = np.minimum(square_length, predictions.square_length(told))
-    scale = replace(_scale(problem, state, square_length), least_square=least_square)
+        known_square = np.minimum(square_length, predictions.square_length_known(told))
+    scale = replace(_scale(problem, state, square_length), known_square=known_square)
     judge = replace(judge, told=replace(judge.told, rotation_variance=turn_variances[closure, 0]))
     spend(_ROW * len(jacobian))
     maps = MapTurns.of(problem, state.position, predictions, problem.stated_variance(state))

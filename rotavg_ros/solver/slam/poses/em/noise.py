@@ -88,7 +88,7 @@ def _likeliest_growth(problem: PoseProblem, solved: Solved, prior: _Prior) -> np
     shaped = scale.floor_share * (problem.mean_closure_shift(solved.state.shape) - 1)
     total = scale.own / scale.shape.size * (1 + shaped)
     told, before = (squares * total**2, freedom * total), solved.state.noise.logarithms[_GROWS]
-    return _likeliest_parts(told, total, scale.least_square[:, None], before, [prior])
+    return _likeliest_parts(told, total, scale.known_square[:, None], before, [prior])
 
 
 def _likeliest_parts(
