@@ -18,7 +18,7 @@ def test_least_squares_with_published_precisions_is_the_answer(kind: str, alike:
     """Tails of odometry, its turns, what FineNet makes of each edge, and closures that hardly count."""
     gtsam = pytest.importorskip("gtsam")
     graph = next(drawings(stress.kinds((kind,), translations=True), [2])).graph
-    # What closures of a run err alike is no edge's own, and a precision is a mean over axes: that moves the answer by a fifth.
+    # What closures of a run err alike is no edge's own, and a precision is a mean over axes (a fifth is due to that).
     found = solve(graph, method="neurora~common-errors" + alike)
     assert found.edge_precision is not None and found.position is not None and graph.translation is not None
     precision, position = found.edge_precision.numpy(), found.position.numpy()
