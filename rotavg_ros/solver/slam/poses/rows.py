@@ -31,6 +31,8 @@ from rotavg_ros.view_graph import ViewGraph
 
 # Motion counts as planar if shifts off the plane are below this share of the longest.
 _PLANAR = 1e-6
+# Cosine of the angle to the normal up to which the first axis is projected onto a plane, else the second.
+_ALONG = 0.9
 # Least length of a step that jumps, as a share of a typical step; steps that err by the way alone err by that of this.
 _LEAST_LENGTH = 1e-3
 # The share of an error that is not shared; the system stays solvable.
@@ -505,7 +507,8 @@ class PoseProblem:
 def _across(normal: np.ndarray) -> np.ndarray:
     """``(3, 2)`` axes of the plane across a unit vector ``(3,)``: the same ones for nearly the same plane."""
     normal = normal * np.sign(normal[np.argmax(np.abs(normal))])
-    first = np.eye(3)[np.argmin(np.abs(normal))]
+    # Not the axis that is least along the normal: of a level plane rounding would tell which.
+    first = np.eye(3)[int(abs(normal[0]) > _ALONG)]
     first = first - (first @ normal) * normal
     first /= np.linalg.norm(first)
     return np.stack((first, np.cross(normal, first)), axis=1)

@@ -95,6 +95,24 @@ def test_directions_and_numbers_do_not_matter() -> None:
     np.testing.assert_allclose(position_errors(renumbered[number].numpy(), found.numpy()), 0.0, atol=1e-4)
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("tilt", [[0.0, 0.0, 0.0], [0.1, 0.05, 0.3], [1.2, -0.4, 0.2]])
+def test_axes_of_a_plane_stay(tilt: list[float]) -> None:
+    """What is known along them is taken over while a graph grows: rounding must not swap or reverse them."""
+    graph, _ = seen_again(0, ahead=AHEAD)
+    assert graph.translation is not None
+    frame = Rotation.from_rotvec(tilt)
+    turned = frame * Rotation.from_quat(graph.target_from_source.numpy()) * frame.inv()
+    jitter = Rotation.from_rotvec(1e-15 * np.random.default_rng(0).normal(size=(graph.num_edges, 3)))
+    way = torch.from_numpy(frame.apply(graph.translation.numpy()))
+    axes = []
+    for each in (turned, jitter * turned):
+        pose = pose_mode(replace(graph, target_from_source=torch.from_numpy(each.as_quat()), translation=way))
+        assert pose.problem.shifts == 2
+        axes.append(pose.problem.bases[1])
+    np.testing.assert_allclose(axes[0], axes[1], atol=1e-6)
+
+
 def test_the_shape_of_a_sample_is_found() -> None:
     """Squares of shifts that nothing else predicts badly are those of the shape, and it is where iterations end."""
     rng = np.random.default_rng(0)

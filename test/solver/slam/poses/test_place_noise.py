@@ -11,12 +11,11 @@ import torch
 from rotavg_ros import ViewGraph, rotations, solve
 from rotavg_ros.evaluation.common.cases import drawings
 from rotavg_ros.evaluation.slam import stress
-from rotavg_ros.solver.slam.poses.closures import Scale
 from rotavg_ros.solver.slam.poses.em.estimate import judge_of
-from rotavg_ros.solver.slam.poses.even_shifts import EvenShifts
 from rotavg_ros.solver.slam.poses.repeats.neighbours import wrong_share
 
 from .test_poses import errors, graph_of, pose_mode, simulated
+from .test_pulls import alike
 
 
 def with_closures(graph: ViewGraph, factor: np.ndarray | float) -> ViewGraph:
@@ -128,16 +127,7 @@ def test_before_any_solve_as_many_places_may_be_wrong_as_is_believed_beforehand(
     problem = pose_mode(graph_of(simulated(1))).problem
     count = len(problem.closures)
     judge = judge_of(problem)
-    scale = Scale(
-        np.ones(count),
-        np.ones(count),
-        np.ones(count),
-        100.0,
-        np.full(count, 100.0),
-        np.zeros(count),
-        np.zeros(count),
-        EvenShifts.alike(count, 2),
-    )
+    scale = alike(count, variance=1.0, extent=100.0)
     places = judge.nothing_known(np.ones(count, dtype=bool), np.zeros(count), scale)
     wrong = problem.priors.wrong_place / problem.priors.counted
     np.testing.assert_allclose(wrong_share(places.chance, problem.told, problem.priors), wrong)

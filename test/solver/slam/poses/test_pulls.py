@@ -32,20 +32,17 @@ def told(count: int) -> Told:
     )
 
 
+def alike(count: int, *, variance: float, extent: float) -> Scale:
+    """Of closures that all err by as many m² along any axis, on a map of ``extent`` m²."""
+    one, nothing, shape = np.ones(count), np.zeros(count), EvenShifts.alike(count, 2)
+    return Scale(variance * one, variance * one, one, extent, extent * one, nothing, nothing, shape)
+
+
 def said_of(count: int, off: float) -> Said:
     """That all are off by some metres along x, which is known to a metre, in a plane of 50 m."""
     mean = np.tile([0.0, off, 0.0], (count, 1))
     covariance = np.tile(np.diag([1e-4, 1.0, 1.0]), (count, 1, 1))
-    scale = Scale(
-        np.full(count, 0.01),
-        np.full(count, 0.01),
-        np.ones(count),
-        2500.0,
-        np.full(count, 2500.0),
-        np.zeros(count),
-        np.zeros(count),
-        EvenShifts.alike(count, 2),
-    )
+    scale = alike(count, variance=0.01, extent=2500.0)
     return Said.of(Predictions(mean, covariance), told(count), 1, scale, PlacePriors())
 
 

@@ -70,7 +70,8 @@ def _as_normal(problem: PoseProblem, solved: Solved) -> np.ndarray:
     k, m, closure = problem.turns, problem.shifts, problem.mode.problem.closure
     total = solved.predictions.covariance.copy()
     total[:, :k, :k] += (1 / solved.rotation_weight[closure, 0])[:, None, None] * np.eye(k)
-    total[:, k:, k:] += np.matmul(solved.closure_back, solved.closure_back.transpose(0, 2, 1))
+    back = solved.closure_back
+    total[:, k:, k:] += np.matmul(back, back.transpose(0, 2, 1))
     mean = solved.predictions.mean
     square = (mean * np.linalg.solve(total, mean[:, :, None])[:, :, 0]).sum(axis=1)
     return np.asarray(-(square + np.linalg.slogdet(total)[1] + (k + m) * np.log(2 * np.pi)) / 2)
