@@ -8,6 +8,7 @@ import numpy as np
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
+from rotavg_ros.solver.slam.poses.row_errors import bridge_variance, closure_turns, mean_over_axes, mean_turn
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.publishing.modes import FAR_TURN, LIKELY, median
 from rotavg_ros.solver.slam.stages import outlier_scores
@@ -78,7 +79,7 @@ def _of_mode(pose: PoseMode) -> Poses:
     of_nodes = pose.solved.factor.variance[: drawn.num_nodes]
     own, shifts = of_nodes[:, :k].mean(axis=1), of_nodes[:, k:].mean(axis=1)
     apart = np.trace(_apart(pose)[:, :k, :k], axis1=1, axis2=2) / k
-    variance = drawn.variance(own, apart, problem.mean_turn(pose.state.noise))
+    variance = drawn.variance(own, apart, mean_turn(problem, pose.state.noise))
     between = (1 - passed) * shifts[drawn.above] + passed * shifts[drawn.below]
     segment = problem.segment_of_node
     spread = pose.state.noise.of_odometry(pose.solved.way.travelled[: drawn.num_segments]) + problem.jumps
@@ -105,7 +106,7 @@ def _precision(pose: PoseMode) -> np.ndarray:
     problem, noise, drawn = pose.problem, pose.state.noise, pose.problem.drawn
     closure, edges = problem.mode.problem.closure, problem.closures
     mean_square = problem.even_turns.mean_square
-    turn = drawn.edge_values(problem.mean_over_axes(1 / pose.solved.rotation_weight) * mean_square)
+    turn = drawn.edge_values(mean_over_axes(problem, 1 / pose.solved.rotation_weight) * mean_square)
     turn *= problem.drawn_steps.share
     slipped = drawn.edge_values((drawn.is_odometry & ~problem.mode.state.is_good).astype(np.float64))
     slip = (problem.priors.slip * problem.typical) ** 2
@@ -138,7 +139,7 @@ def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray
     bent = np.zeros((3, drawn.paths.forest.parent.shape[0]))
     lever = np.cross(way.lever[inner], pulled[segment]) @ problem.bases[0]
     about = lever @ problem.about_drift_axis
-    of_about, of_others = problem.bridge_variance(state.noise)[:, segment, None]
+    of_about, of_others = bridge_variance(problem, state.noise)[:, segment, None]
     bent[:, inner] = ((of_about * about + of_others * (lever - about)) @ problem.bases[0].T).T
     turned = quaternion_rows.multiply(np.ascontiguousarray(orientation.T), quaternion_rows.exp(bent))
     orientation = np.ascontiguousarray(quaternion_rows.normalize(turned).T)
@@ -160,7 +161,7 @@ def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
     predictions = pose.solved.predictions
     closure, k = mode.problem.closure, problem.turns
     uneven = problem.told.uneven
-    own = problem.closure_turns(pose.state.noise) * problem.even_turns.mean_square[closure]
+    own = closure_turns(problem, pose.state.noise) * problem.even_turns.mean_square[closure]
     turn = np.sqrt((predictions.turn(uneven) ** 2).sum(axis=1))
     covariance = uneven @ predictions.covariance[:, :k, :k] @ uneven
     predicted = np.trace(covariance, axis1=1, axis2=2) / k

@@ -10,7 +10,7 @@ from rotavg_ros.solver.algebra.small_matrices import eigh, inverse_root
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.noise.repeats import Near, places_near
-from rotavg_ros.solver.slam.poses.even_shifts import EvenShifts
+from rotavg_ros.solver.slam.poses.even.shifts import EvenShifts
 from rotavg_ros.solver.slam.posterior.densities import log_half_turn
 
 # Classes of good closures come first.
@@ -119,7 +119,7 @@ class Told:
 
     Attributes:
         rotation_variance: ``(C,)`` rad² per component, of a good closure's even turn
-            (:mod:`rotavg_ros.solver.slam.poses.even_turns`).
+            (:mod:`rotavg_ros.solver.slam.poses.even.turns`).
         uneven: ``(C, k, k)`` from a closure's even turn to its turn.
         false_odds: ``(C,)`` nats: log density of the turn if false, plus the prior log-odds of being false. Near misses
             have the prediction's variance added. For a labelled closure, only what that adds to the log density.

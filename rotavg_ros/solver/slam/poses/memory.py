@@ -17,7 +17,8 @@ from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.poses.answer import Poses
 from rotavg_ros.solver.slam.poses.closures import Places
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
-from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.row_errors import mean_turn
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.poses.state import PoseNoise, PoseState
 from rotavg_ros.solver.slam.posterior.mode import Mode
@@ -114,7 +115,7 @@ class PoseMemory:
     @property
     def step_variance(self) -> float:
         """rad², variance of one step of odometry, averaged over components and steps."""
-        return self.pose.problem.mean_turn(self.noise)
+        return mean_turn(self.pose.problem, self.noise)
 
     def extended(self, graph: ViewGraph, growth: Growth) -> PoseMemory | None:
         """The memory with new nodes placed along odometry; None if that has no translations."""

@@ -1,44 +1,17 @@
-"""The rows of the joint system: residuals of turns and shifts, what they depend on, and how far each errs."""
+"""The rows of the joint system: residuals of turns and shifts, what they depend on, and their weights."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-
 import numpy as np
-import torch
 
-from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.algebra.odometry_lengths import typical_length, ways_passed
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
-from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
-from rotavg_ros.solver.algebra.sparse.block_system import BlockEquations
-from rotavg_ros.solver.running.cached import cached_property
-from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
-from rotavg_ros.solver.slam.graph.routes import way_along
-from rotavg_ros.solver.slam.poses.closures import ANYHOW, NOTHING, Told
-from rotavg_ros.solver.slam.poses.displacements import Displacements, DrawnSteps
-from rotavg_ros.solver.slam.poses.even_shifts import EvenShifts, likeliest_shape
-from rotavg_ros.solver.slam.poses.even_turns import EvenTurns
-from rotavg_ros.solver.slam.poses.priors import PlacePriors
-from rotavg_ros.solver.slam.poses.state import PoseNoise, PoseState
-from rotavg_ros.solver.slam.posterior.densities import log_false, log_good
-from rotavg_ros.solver.slam.posterior.mode import Mode
-from rotavg_ros.solver.slam.posterior.rows import tails, variances
-from rotavg_ros.solver.slam.posterior.state import RUN_STEPS
-from rotavg_ros.solver.slam.posterior.system import NormalEquations
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.solver.slam.poses.closures import ANYHOW
+from rotavg_ros.solver.slam.poses.displacements import Displacements
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.row_errors import common_turn
+from rotavg_ros.solver.slam.poses.state import PoseState
 
-# Motion counts as planar if shifts off the plane are below this share of the longest.
-_PLANAR = 1e-6
-# Cosine of the angle to the normal up to which the first axis is projected onto a plane, else the second.
-_ALONG = 0.9
-# Least length of a step that jumps, as a share of a typical step; steps that err by the way alone err by that of this.
-_LEAST_LENGTH = 1e-3
-# The share of an error that is not shared; the system stays solvable.
-_NONE = 1e-6
-# Closures longer than this many times all of odometry are clipped to that length.
-_FARTHEST = 1e3
 # Stiffness of the roots, relative to the stiffest row.
 _GROUNDING = 1e6
 
@@ -48,467 +21,77 @@ def crossing(turns: np.ndarray, shifts: np.ndarray) -> np.ndarray:
     return np.asarray(np.cross(turns.T[None], shifts.T[:, None]).reshape(-1, 3).T)
 
 
-@dataclass(frozen=True)
-class PoseProblem:
-    """A labelling of a robot's graph, with translations (E edges: S segments first; C closures).
+def residuals(problem: PoseProblem, state: PoseState, way: Displacements) -> np.ndarray:
+    """``(E + R, k + m)`` measured minus predicted, with even turns."""
+    drawn, (turns, shifts) = problem.drawn, problem.bases
+    measured = problem.mode.problem.measured
+    turn = quaternion_rows.residual_vectors(state.correction, measured, drawn.source, drawn.target)
+    shift = way.displacement - (state.position[drawn.target] - state.position[drawn.source])
+    even = np.matmul(problem.even_turns.even, (turn @ turns)[:, :, None])[:, :, 0]
+    both = np.concatenate((even, shift @ shifts), axis=1)
+    common = np.concatenate((state.common[:, :3] @ turns, state.common[:, 3:] @ shifts), axis=1)
+    shared = np.flatnonzero(problem.run >= 0)
+    both[shared] -= problem.sign[shared, None] * common[problem.run[shared]]
+    return np.concatenate((both, -common))
 
-    Attributes:
-        graph: the view-graph whose odometry was contracted, N nodes and M edges.
-        translation: ``(M, 3)`` position of the target in the source's frame, metres; NaN where unknown, of closures.
-        mode: the labelling by rotations alone.
-        priors: of translations.
-        jump: ``(M,)`` m² per component, variance of the jump of each edge of odometry; 0 where there is none. None:
-            nowhere.
+
+def jacobian(problem: PoseProblem, way: Displacements) -> np.ndarray:
+    """``(E + R, d, 3 d)`` by the blocks of target, source and run."""
+    k, d = problem.turns, problem.turns + problem.shifts
+    num_edges = len(problem.drawn.source)
+    rows = np.zeros((num_edges + problem.num_runs, d, 3 * d))
+    edges, unit = rows[:num_edges], np.eye(d)
+    edges[:, :, :d], edges[:, :, d : 2 * d] = unit, -unit
+    edges[:, :k, :k], edges[:, :k, d : d + k] = problem.even_turns.even, -problem.even_turns.even
+    edges[:, k:, :k] = -_crossed(problem, way.at_target)
+    edges[:, k:, d : d + k] = -_crossed(problem, way.at_source)
+    edges[:, :, 2 * d :] = problem.sign[:, None, None] * unit
+    rows[num_edges:, :, :d] = unit
+    return rows
+
+
+def _crossed(problem: PoseProblem, vector: np.ndarray) -> np.ndarray:
+    """``(E, m, k)`` matrices of v × in the bases."""
+    return np.asarray((vector @ crossing(*problem.bases)).reshape(len(vector), problem.shifts, problem.turns))
+
+
+def whitening(
+    problem: PoseProblem,
+    covariance: np.ndarray,
+    rotation_weight: np.ndarray,
+    closure_root: np.ndarray,
+    state: PoseState,
+) -> np.ndarray:
+    """``(E + R, d, d)`` W^½ of all rows.
+
+    Args:
+        covariance: ``(E, m, m)`` covariances of shifts.
+        rotation_weight: ``(E, 2)`` rad⁻², about the drift axis and any other one.
+        closure_root: ``(C, m, m)`` m⁻¹, of closures' shifts.
+        state: gives the noise.
     """
-
-    graph: ViewGraph
-    translation: np.ndarray
-    mode: Mode
-    priors: PlacePriors = field(default_factory=PlacePriors)
-    jump: np.ndarray | None = None
-
-    @cached_property
-    def drawn(self) -> ClosureGraph:
-        """The contracted graph, with nodes placed along segments in proportion to odometry's variance."""
-        return self.mode.problem.drawn(self.mode.state.noise)
-
-    @cached_property
-    def lengths(self) -> np.ndarray:
-        """``(M, 3)`` translations, 0 where unknown; those of closures are clipped to ``_FARTHEST`` times odometry's."""
-        known = np.isfinite(self.translation).all(axis=1, keepdims=True)
-        lengths = np.where(known, self.translation, 0.0)
-        is_odometry = self.graph.is_odometry.numpy()
-        farthest = _FARTHEST * float(np.abs(lengths[is_odometry]).sum())
-        return np.where(is_odometry[:, None], lengths, np.clip(lengths, -farthest, farthest))
-
-    @cached_property
-    def way(self) -> np.ndarray:
-        """``(M,)`` metres travelled along each edge's steps."""
-        return ways_passed(self.lengths, way_along(self.graph))
-
-    @cached_property
-    def typical(self) -> float:
-        """Metres, length of a typical step of odometry."""
-        return typical_length(self.way, self.graph.steps.numpy(), self.graph.is_odometry.numpy())
-
-    @cached_property
-    def travelled(self) -> np.ndarray:
-        """``(M, 2)`` metres, and steps, of each edge."""
-        return np.stack((self.way, self.graph.steps.numpy()), axis=1)
-
-    @cached_property
-    def bases(self) -> tuple[np.ndarray, np.ndarray]:
-        """``(3, k)`` axes of turns and ``(3, m)`` of shifts: one and two where all motion is in a plane, else three."""
-        if self.mode.problem.components == 3:
-            return np.eye(3), np.eye(3)
-        vectors = rotations.log(self.graph.target_from_source).numpy()
-        normal = np.linalg.eigh(vectors.T @ vectors)[1][:, 2]
-        off = np.abs(self.lengths @ normal).max(initial=0.0)
-        is_planar = off <= _PLANAR * np.abs(self.lengths).max(initial=0.0)
-        return normal[:, None], _across(normal) if is_planar else np.eye(3)
-
-    @cached_property
-    def drift_axis(self) -> np.ndarray | None:
-        """``(3,)`` unit vector of the world, the vertical, where the robot knows one; None: all axes are alike."""
-        problem = self.mode.problem
-        known = problem.upright if self.turns == 3 and "tilt" not in problem.without else None
-        if known is None:
-            return None
-        sound = np.flatnonzero(self.mode.state.is_good[: self.drawn.num_segments])
-        return known.sharpened(self.mode.evaluation.residual[sound], self.own[sound])
-
-    @cached_property
-    def about_drift_axis(self) -> np.ndarray:
-        """``(k, k)`` projection of a turn onto the drift axis; the identity where there is none."""
-        return np.eye(self.turns) if self.drift_axis is None else np.outer(self.drift_axis, self.drift_axis)
-
-    @cached_property
-    def even_turns(self) -> EvenTurns:
-        """Units in which the rows' turns err alike about all axes.
-
-        Where gravity holds some axes these are known, and closures' residuals by rotations alone would seem to err
-        about the vertical, as odometry does.
-        """
-        if self.turns < 3 or self.drift_axis is not None or "body-axes" in self.mode.problem.without:
-            return EvenTurns.alike(len(self.drawn.source), self.turns)
-        return EvenTurns.of(self.mode)
-
-    @property
-    def num_about(self) -> int:
-        """Number of components of a turn about the drift axis; all of them where there is none."""
-        return self.turns if self.drift_axis is None else 1
-
-    def mean_turn(self, noise: PoseNoise) -> float:
-        """rad², variance of one step of odometry, averaged over components."""
-        of_even = float(self.mean_over_axes(np.array([noise.turn, noise.tilt])))
-        return of_even * self._mean_square(np.arange(self.drawn.num_segments))
-
-    def mean_closure_turn(self, noise: PoseNoise) -> float:
-        """rad², variance of a typical good closure, averaged over components."""
-        return noise.closure_turn * self._mean_square(self.mode.problem.closure)
-
-    def _mean_square(self, rows: np.ndarray) -> float:
-        """Mean over some edges of the variance of a turn whose even turn has the variance 1."""
-        return float(self.even_turns.mean_square[rows].mean()) if len(rows) else 1.0
-
-    def mean_over_axes(self, variance: np.ndarray) -> np.ndarray:
-        """Variances about the drift axis and any other one, ``(…, 2)`` → their mean over components, ``(…)``."""
-        about = self.num_about / self.turns
-        return np.asarray(about * variance[..., 0] + (1 - about) * variance[..., 1])
-
-    @property
-    def turns(self) -> int:
-        """Number of components of a turn, k."""
-        return int(self.bases[0].shape[1])
-
-    @property
-    def shifts(self) -> int:
-        """Number of components of a shift, m."""
-        return int(self.bases[1].shape[1])
-
-    @cached_property
-    def own(self) -> np.ndarray:
-        """``(E,)`` rad², variance of the noise of each turn."""
-        return variances(self.mode.problem, self.mode.state.noise)[: len(self.drawn.source)]
-
-    @cached_property
-    def runs(self) -> NormalEquations:
-        """Runs with common errors: translations always have them; the length is that of turns, if these have them."""
-        noise = self.mode.state.noise
-        return self.mode.problem.system(noise if noise.run_steps > 0 else replace(noise, run_steps=RUN_STEPS[-1]))
-
-    @property
-    def steps_err(self) -> bool:
-        """Whether a part of the error of odometry's shifts does not depend on the steps' lengths."""
-        return "step-errors" not in self.mode.problem.without
-
-    @property
-    def turns_share(self) -> bool:
-        """Whether turns of closures that are near each other err alike."""
-        return self.mode.state.noise.run_steps > 0
-
-    @cached_property
-    def run(self) -> np.ndarray:
-        """``(E,)`` number of the run whose error each edge shares, or -1."""
-        return np.where(self.runs.shared, self.runs.run, -1)
-
-    @cached_property
-    def sign(self) -> np.ndarray:
-        """``(E,)`` sign of the common error in each edge, 0 if it has none."""
-        return np.where(self.run >= 0, self.runs.sign, 0.0)
-
-    @property
-    def num_runs(self) -> int:
-        return self.runs.num_runs
-
-    def common_turn(self, noise: PoseNoise) -> float:
-        """rad², variance of the turn that a run has in common; negligible where turns err independently."""
-        return noise.closure_turn * (self.mode.state.noise.common_share if self.turns_share else _NONE)
-
-    @cached_property
-    def turn_noise(self) -> PoseNoise:
-        """Initial noise: turns' from rotations alone, shifts' from the prior."""
-        noise, priors, typical = self.mode.state.noise, self.priors, self.typical
-        way, closure = priors.step**2 * typical, (priors.closure * typical) ** 2
-        own, common = (1 - priors.common) * closure, priors.common * closure
-        turn = noise.step_variance
-        step = (priors.still * typical) ** 2 if self.steps_err else _LEAST_LENGTH * typical * way
-        return PoseNoise(turn, noise.closure_variance, way, own, priors.relative**2, common, step, turn)
-
-    @cached_property
-    def slipped(self) -> np.ndarray:
-        """``(S,)`` bool, segments that slipped."""
-        return np.asarray(~self.mode.state.is_good[: self.drawn.num_segments])
-
-    @cached_property
-    def jumps(self) -> np.ndarray:
-        """``(S,)`` m² per component, variance of the jump of each segment's shift; 0 where there is none."""
-        of_segment = np.zeros(self.drawn.num_segments)
-        if self.jump is not None:
-            segment = self.drawn.segment_of_edge
-            on_segment = np.flatnonzero(segment >= 0)
-            np.maximum.at(of_segment, segment[on_segment], self.jump[on_segment])
-        return of_segment
-
-    @cached_property
-    def _step_reports(self) -> np.ndarray:
-        """``(M,)`` metres, longest step that each edge may contain: of several steps, the rest beside typical ones."""
-        steps = self.graph.steps.numpy()
-        return np.asarray(np.maximum(self.way - (steps - 1) * self.typical, self.way / steps))
-
-    @cached_property
-    def longest_steps(self) -> np.ndarray:
-        """``(S,)`` the edge with the longest reported step in each segment."""
-        segment = self.drawn.segment_of_edge
-        edge = np.flatnonzero(segment >= 0)
-        order = np.lexsort((-self._step_reports[edge], segment[edge]))
-        return np.asarray(edge[order][np.unique(segment[edge][order], return_index=True)[1]])
-
-    @cached_property
-    def could_jump(self) -> np.ndarray:
-        """``(S,)`` m² per component, variance of a jump of each segment: the square of its longest reported step."""
-        return np.asarray(np.maximum(self._step_reports[self.longest_steps], _LEAST_LENGTH * self.typical) ** 2)
-
-    def turn_variances(self, noise: PoseNoise) -> np.ndarray:
-        """``(E, 2)`` rad² about the drift axis and any other one, tails as the last solve weighed them.
-
-        Of even turns; for odometry as labelled, for closures as good ones.
-        """
-        state, priors, is_odometry = self.mode.state, self.mode.problem.priors, self.drawn.is_odometry
-        steps = np.array([[noise.turn, noise.tilt]]) / state.noise.step_variance
-        closure = noise.closure_turn / state.noise.closure_variance
-        own = self.own[:, None] * np.where(is_odometry[:, None], steps, closure)
-        slip = np.radians(priors.slip_deg) ** 2
-        slipped = (is_odometry & ~state.is_good)[:, None]
-        return np.asarray(np.where(slipped, own + slip, own / state.others.relative[:, None]))
-
-    def closure_turns(self, noise: PoseNoise) -> np.ndarray:
-        """``(C,)`` rad², variances of closures as good ones."""
-        return np.asarray(self.turn_variances(noise)[self.mode.problem.closure, 0])
-
-    def bridge_variance(self, noise: PoseNoise) -> np.ndarray:
-        """``(2, S)`` rad² a step within segments, about the drift axis and any other; a slip may be at any step."""
-        slip = np.radians(self.mode.problem.priors.slip_deg) ** 2
-        of_step = np.array([[noise.turn], [noise.tilt]])
-        slipped = of_step + slip / np.maximum(self.steps, 1.0)
-        return np.asarray(np.where(self.slipped, slipped, of_step * self.tailed))
-
-    @cached_property
-    def tailed(self) -> np.ndarray:
-        """``(S,)`` factor of each segment's variance due to tails, as weighted in the last solve."""
-        return np.asarray(1 / self.mode.state.others.relative[: self.drawn.num_segments])
-
-    @cached_property
-    def segment_of_node(self) -> np.ndarray:
-        """``(N,)`` the segment within which each node lies; -1 for key nodes."""
-        drawn = self.drawn
-        inner = np.flatnonzero(drawn.paths.hangs_on_odometry & (drawn.above != drawn.below))
-        segment = np.full(self.graph.num_nodes, -1)
-        segment[inner] = drawn.segment_of_edge[drawn.paths.forest.parent_edge[inner]]
-        return segment
-
-    @cached_property
-    def steps(self) -> np.ndarray:
-        """``(S,)`` variance of each segment's turn, in units of that of one step."""
-        return self.own[: self.drawn.num_segments] / self.mode.state.noise.step_variance
-
-    @cached_property
-    def closures(self) -> np.ndarray:
-        """``(C,)`` the view-graph's edges of the closures."""
-        return np.asarray(self.drawn.view_graph_edge[self.mode.problem.closure - self.drawn.num_segments])
-
-    @cached_property
-    def stated_square(self) -> np.ndarray:
-        """``(C,)`` m², squared lengths that closures state."""
-        return np.asarray((self.lengths[self.closures] ** 2).sum(axis=1))
-
-    def stated_variance(self, state: PoseState) -> np.ndarray:
-        """``(C,)`` m² per component, mean over axes, of good closures that are as long as they state."""
-        noise = state.noise.of_constant_times(self.mean_closure_shift(state.shape))
-        return noise.of_closures(self.stated_square)
-
-    def own_variance(self, noise: PoseNoise, square_length: np.ndarray) -> np.ndarray:
-        """``(C,)`` m² per component, the part of good closures' variance that they do not share with their runs.
-
-        Args:
-            noise: all variances.
-            square_length: ``(C,)`` m², squared lengths of closures.
-        """
-        is_shared = self.run[self.mode.problem.closure] >= 0
-        return np.asarray(noise.of_closures(square_length) - is_shared * noise.common)
-
-    def even_shifts(self, state: PoseState, share: np.ndarray) -> EvenShifts:
-        """Units in which closures' shifts err alike along all axes; a share ``(C,)`` of their variances has a shape."""
-        drawn, closure = self.drawn, self.mode.problem.closure
-        older = drawn.nodes[np.where(drawn.is_forward[closure], drawn.source[closure], drawn.target[closure])]
-        body_from_world = np.ascontiguousarray(self.orientations(state)[older].T)
-        frame = self.bases[1].T @ quaternion_rows.matrices(quaternion_rows.inverse(body_from_world)) @ self.bases[1]
-        return EvenShifts.of(self.bases[1].T @ state.shape @ self.bases[1], frame, share)
-
-    def mean_closure_shift(self, shape: np.ndarray) -> float:
-        """Variance of a closure's shift, averaged over components, if that of an even one is 1."""
-        return float(np.trace(self.bases[1].T @ shape @ self.bases[1])) / self.shifts
-
-    def likeliest_shape(self, shape: np.ndarray, along_body: np.ndarray) -> np.ndarray:
-        """``(3, 3)`` shape of closures' shifts in the body's axes, from squares and freedom ``(2, m, m)`` there."""
-        if "shift-axes" in self.mode.problem.without:
-            return shape
-        axes = self.bases[1]
-        found = likeliest_shape(axes.T @ shape @ axes, *along_body)
-        return np.asarray(axes @ found @ axes.T + np.eye(3) - axes @ axes.T)
-
-    @cached_property
-    def told(self) -> Told:
-        """What rotations alone say of closures."""
-        problem, state, left_out = self.mode.problem, self.mode.state, self.mode.left_out
-        closure, k = problem.closure, problem.components
-        tailed = tails(problem, state.noise).of(closure)
-        square, predicted = left_out.square[closure], left_out.predicted[closure]
-        good, _ = log_good(square, self.own[closure], predicted, k, tailed)
-        odds = problem.log_odds[closure]
-        label = np.where(np.isinf(odds), np.sign(odds), 0.0)
-        with np.errstate(invalid="ignore"):
-            false_odds = np.where(label == 0, good - left_out.log_odds[closure], 0.0)
-        # A similar-looking place is seen at nearly the angle at which the true one would be, which may be uncertain.
-        priors = problem.priors
-        broad = predicted / (1 + predicted / ANYHOW)
-        false_odds += log_false(square, k, priors, predicted=broad) - log_false(square, k, priors)
-        is_known = np.isfinite(self.translation).all(axis=1)[self.closures]
-        own = self.closure_turns(self.turn_noise)
-        order = problem.detection, problem.detected
-        uneven = self.even_turns.uneven[closure]
-        return Told(own, uneven, false_odds, is_known, label, problem.run, problem.follows, problem.sign, *order)
-
-    @cached_property
-    def equations(self) -> BlockEquations:
-        """The pattern of the joint system."""
-        drawn = self.drawn
-        ends = np.stack((drawn.source, drawn.target), axis=1)
-        return BlockEquations((self.turns, self.shifts), drawn.num_nodes, ends, self.run, drawn.roots, self.loose)
-
-    @cached_property
-    def loose(self) -> np.ndarray:
-        """Key nodes at which chains of odometry begin, except chains with a root."""
-        drawn = self.drawn
-        chain = drawn.chain
-        first = np.unique(chain, return_index=True)[1]
-        return np.asarray(first[~np.isin(chain[first], chain[drawn.roots])])
-
-    def orientations(self, state: PoseState) -> np.ndarray:
-        """``(N, 4)`` body_from_world of all nodes."""
-        correction = torch.from_numpy(np.ascontiguousarray(state.correction.T))
-        return np.asarray(self.drawn.orientations(correction).numpy())
-
-    @cached_property
-    def drawn_steps(self) -> DrawnSteps:
-        """Odometry's steps, in the order of the segments."""
-        by_turns = self.mode.problem.by_turns(self.mode.state.noise)
-        return DrawnSteps(self.graph, self.lengths, self.travelled, self.drawn, self.steps, by_turns)
-
-    def displacements(self, body_from_world: np.ndarray) -> Displacements:
-        """Displacements at orientations ``(N, 4)``."""
-        return self.drawn_steps.displacements(body_from_world)
-
-    def along_odometry(self, way: Displacements) -> np.ndarray:
-        """``(K, 3)`` metres, positions of the key nodes by odometry's displacements from its roots."""
-        drawn = self.drawn
-        forest = drawn.paths.forest
-        step = np.zeros((self.graph.num_nodes, 3))
-        segments = slice(drawn.num_segments)
-        step[drawn.nodes[drawn.target[segments]]] = way.displacement[segments]
-        from_root = [accumulate_to_root(forest, column) for column in step.T]
-        return np.asarray(np.stack(from_root, axis=1)[drawn.nodes])
-
-    def residuals(self, state: PoseState, way: Displacements) -> np.ndarray:
-        """``(E + R, k + m)`` measured minus predicted, with even turns."""
-        drawn, (turns, shifts) = self.drawn, self.bases
-        measured = self.mode.problem.measured
-        turn = quaternion_rows.residual_vectors(state.correction, measured, drawn.source, drawn.target)
-        shift = way.displacement - (state.position[drawn.target] - state.position[drawn.source])
-        even = np.matmul(self.even_turns.even, (turn @ turns)[:, :, None])[:, :, 0]
-        both = np.concatenate((even, shift @ shifts), axis=1)
-        common = np.concatenate((state.common[:, :3] @ turns, state.common[:, 3:] @ shifts), axis=1)
-        shared = np.flatnonzero(self.run >= 0)
-        both[shared] -= self.sign[shared, None] * common[self.run[shared]]
-        return np.concatenate((both, -common))
-
-    def jacobian(self, way: Displacements) -> np.ndarray:
-        """``(E + R, d, 3 d)`` by the blocks of target, source and run."""
-        k, d = self.turns, self.turns + self.shifts
-        num_edges = len(self.drawn.source)
-        rows = np.zeros((num_edges + self.num_runs, d, 3 * d))
-        edges, unit = rows[:num_edges], np.eye(d)
-        edges[:, :, :d], edges[:, :, d : 2 * d] = unit, -unit
-        edges[:, :k, :k], edges[:, :k, d : d + k] = self.even_turns.even, -self.even_turns.even
-        edges[:, k:, :k] = -self._crossed(way.at_target)
-        edges[:, k:, d : d + k] = -self._crossed(way.at_source)
-        edges[:, :, 2 * d :] = self.sign[:, None, None] * unit
-        rows[num_edges:, :, :d] = unit
-        return rows
-
-    @cached_property
-    def _crossing(self) -> np.ndarray:
-        return crossing(*self.bases)
-
-    def _crossed(self, vector: np.ndarray) -> np.ndarray:
-        """``(E, m, k)`` matrices of v × in the bases."""
-        return np.asarray((vector @ self._crossing).reshape(len(vector), self.shifts, self.turns))
-
-    def shift_covariance(self, state: PoseState, way: Displacements) -> np.ndarray:
-        """``(E, m, m)`` m², covariance of odometry's shifts; for closures, the unshared part as good ones."""
-        drawn, num_segments = self.drawn, self.drawn.num_segments
-        unit = np.eye(self.shifts)
-        noise = state.noise
-        variance = noise.of_odometry(way.travelled)
-        slipped = drawn.is_odometry & ~self.mode.state.is_good
-        variance += np.where(slipped, (self.priors.slip * self.typical) ** 2, 0.0)
-        variance[:num_segments] += self.jumps
-        # Rejected odometry beside the chain connects nothing else, so it does not pull.
-        variance[num_segments:] = np.where(slipped, variance / NOTHING, variance)[num_segments:]
-        variance[self.mode.problem.closure] = self.own_variance(noise, self.stated_square)
-        covariance = variance[:, None, None] * unit
-        bending = self.bridge_variance(noise)[:, :, None, None] * self.bent(way)
-        covariance[: drawn.num_segments] += bending.sum(axis=0)
-        return np.asarray(covariance)
-
-    def bent(self, way: Displacements) -> np.ndarray:
-        """``(2, S, m, m)`` m² per rad² a step, of segments' shifts due to bending, about the drift axis and the others.
-
-        Turns about n alone contribute ∫ (d × n) (d × n)ᵀ dq to ∫ (‖d‖² I − d dᵀ) dq.
-        """
-        shifts, bridge = self.bases[1], way.bridge[: self.drawn.num_segments]
-        about = bridge
-        if self.drift_axis is not None:
-            second = np.trace(bridge, axis1=1, axis2=2)[:, None, None] / 2 * np.eye(3) - bridge
-            crossed = np.cross(np.eye(3), self.drift_axis)
-            about = crossed.T @ second @ crossed
-        return np.asarray(shifts.T @ np.stack((about, bridge - about)) @ shifts)
-
-    def whitening(
-        self,
-        covariance: np.ndarray,
-        rotation_weight: np.ndarray,
-        closure_root: np.ndarray,
-        state: PoseState,
-    ) -> np.ndarray:
-        """``(E + R, d, d)`` W^½ of all rows.
-
-        Args:
-            covariance: ``(E, m, m)`` covariances of shifts.
-            rotation_weight: ``(E, 2)`` rad⁻², about the drift axis and any other one.
-            closure_root: ``(C, m, m)`` m⁻¹, of closures' shifts.
-            state: gives the noise.
-        """
-        k, m = self.turns, self.shifts
-        num_edges = len(covariance)
-        root = np.zeros((num_edges + self.num_runs, k + m, k + m))
-        edges, common = root[:num_edges], root[num_edges:]
-        about, other = np.sqrt(rotation_weight).T[:, :, None, None]
-        edges[:, :k, :k] = about * self.about_drift_axis + other * (np.eye(k) - self.about_drift_axis)
-        # Upper triangular: Cholesky from the last component backwards.
-        edges[:, k:, k:] = inverse_root(covariance[:, ::-1, ::-1])[:, ::-1, ::-1]
-        edges[self.mode.problem.closure, k:, k:] = closure_root
-        if self.num_runs:
-            common[:, :k, :k] = np.eye(k) / np.sqrt(self.common_turn(state.noise))
-            common[:, k:, k:] = np.eye(m) / np.sqrt(state.noise.common)
-        return root
-
-    def loose_weight(self, extent: float) -> np.ndarray:
-        """``(d,)`` weight of chains that nothing joins: any turn, and anywhere on a map of ``extent`` m²."""
-        return np.concatenate((np.full(self.turns, 1 / ANYHOW), np.full(self.shifts, 1 / extent)))
-
-    def root_weight(self, rotation_weight: np.ndarray, state: PoseState) -> np.ndarray:
-        """``(d,)`` weight that ties roots down."""
-        shift = max(1 / state.noise.step, 1 / state.noise.closure)
-        tied = np.full(self.turns, float(rotation_weight.max())), np.full(self.shifts, shift)
-        return _GROUNDING * np.concatenate(tied)
-
-
-def _across(normal: np.ndarray) -> np.ndarray:
-    """``(3, 2)`` axes of the plane across a unit vector ``(3,)``: the same ones for nearly the same plane."""
-    normal = normal * np.sign(normal[np.argmax(np.abs(normal))])
-    # Not the axis that is least along the normal: of a level plane rounding would tell which.
-    first = np.eye(3)[int(abs(normal[0]) > _ALONG)]
-    first = first - (first @ normal) * normal
-    first /= np.linalg.norm(first)
-    return np.stack((first, np.cross(normal, first)), axis=1)
+    k, m = problem.turns, problem.shifts
+    num_edges = len(covariance)
+    root = np.zeros((num_edges + problem.num_runs, k + m, k + m))
+    edges, common = root[:num_edges], root[num_edges:]
+    about, other = np.sqrt(rotation_weight).T[:, :, None, None]
+    edges[:, :k, :k] = about * problem.about_drift_axis + other * (np.eye(k) - problem.about_drift_axis)
+    # Upper triangular: Cholesky from the last component backwards.
+    edges[:, k:, k:] = inverse_root(covariance[:, ::-1, ::-1])[:, ::-1, ::-1]
+    edges[problem.mode.problem.closure, k:, k:] = closure_root
+    if problem.num_runs:
+        common[:, :k, :k] = np.eye(k) / np.sqrt(common_turn(problem, state.noise))
+        common[:, k:, k:] = np.eye(m) / np.sqrt(state.noise.common)
+    return root
+
+
+def loose_weight(problem: PoseProblem, extent: float) -> np.ndarray:
+    """``(d,)`` weight of chains that nothing joins: any turn, and anywhere on a map of ``extent`` m²."""
+    return np.concatenate((np.full(problem.turns, 1 / ANYHOW), np.full(problem.shifts, 1 / extent)))
+
+
+def root_weight(problem: PoseProblem, rotation_weight: np.ndarray, state: PoseState) -> np.ndarray:
+    """``(d,)`` weight that ties roots down."""
+    shift = max(1 / state.noise.step, 1 / state.noise.closure)
+    tied = np.full(problem.turns, float(rotation_weight.max())), np.full(problem.shifts, shift)
+    return _GROUNDING * np.concatenate(tied)

@@ -9,8 +9,8 @@ import numpy as np
 from rotavg_ros.solver.algebra.sparse.block_system import BlockFactor
 from rotavg_ros.solver.slam.poses.closures import Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.displacements import Displacements
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
-from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.state import PoseState
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rotavg_ros.solver.slam.poses.row_errors import mean_closure_shift, mean_closure_turn, mean_turn
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.poses.state import PoseNoise
 from rotavg_ros.solver.slam.posterior.mode import Mode
@@ -112,10 +113,10 @@ class Linear:
         """From a joint solve."""
         problem, solved, drawn = pose.problem, pose.solved, pose.problem.drawn
         # A single mean variance for all axes.
-        turn = problem.mean_turn(pose.state.noise)
-        closure = problem.mean_closure_turn(pose.state.noise)
+        turn = mean_turn(problem, pose.state.noise)
+        closure = mean_closure_turn(problem, pose.state.noise)
         noise = replace(pose.state.noise, turn=turn, tilt=turn, closure_turn=closure).of_constant_times(
-            problem.mean_closure_shift(pose.state.shape)
+            mean_closure_shift(problem, pose.state.shape)
         )
         turns, shifts = problem.bases
         segment = problem.segment_of_node

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.metrics.positions import position_errors
 from rotavg_ros.solver import solve
-from rotavg_ros.solver.slam.poses.even_shifts import EvenShifts, likeliest_shape
+from rotavg_ros.solver.slam.poses.even.shifts import EvenShifts, likeliest_shape
 from rotavg_ros.view_graph import ViewGraph
 
 from .test_poses import SimulatedRun, errors, graph_of, pose_mode, simulated

@@ -15,7 +15,7 @@ from rotavg_ros.evaluation.slam import pose_cases
 from rotavg_ros.solver.neurora.network_store import load_network
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
-from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.stages import bootstrap

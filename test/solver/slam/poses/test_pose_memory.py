@@ -11,7 +11,7 @@ import torch
 from rotavg_ros import ViewGraph, rotations, solve
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
-from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.solver.solution import Solution

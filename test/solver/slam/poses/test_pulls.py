@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from rotavg_ros.solver.slam.poses.closures import GOOD, Predictions, Scale, Told
-from rotavg_ros.solver.slam.poses.even_shifts import EvenShifts
+from rotavg_ros.solver.slam.poses.even.shifts import EvenShifts
 from rotavg_ros.solver.slam.poses.places.classes import CLASSES, Said
 from rotavg_ros.solver.slam.poses.places.pulls import pulled
 from rotavg_ros.solver.slam.poses.priors import PlacePriors

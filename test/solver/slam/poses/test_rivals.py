@@ -17,7 +17,7 @@ from rotavg_ros.solver.slam import stages
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
-from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.search.rivals import rival_poses
 from rotavg_ros.solver.slam.poses.search.settling import settling
 from rotavg_ros.solver.slam.posterior.em import polish

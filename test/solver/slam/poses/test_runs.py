@@ -11,6 +11,7 @@ import torch
 from rotavg_ros.solver.slam.poses.closures import NOTHING
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
+from rotavg_ros.solver.slam.poses.rows import jacobian, root_weight, whitening
 from rotavg_ros.solver.slam.poses.search.runs import (
     runs_to_believe,
     runs_to_doubt,
@@ -95,8 +96,8 @@ def test_what_a_run_has_in_common_is_what_all_other_rows_say(seed: int) -> None:
     problem, solved = pose.problem, pose.solved
     d, num_edges = problem.turns + problem.shifts, len(problem.drawn.source)
     turn_weight, state = solved.rotation_weight, pose.state
-    root = problem.whitening(solved.covariance, turn_weight, solved.closure_root, state)
-    rows = np.matmul(root, problem.jacobian(solved.way))
+    root = whitening(problem, solved.covariance, turn_weight, solved.closure_root, state)
+    rows = np.matmul(root, jacobian(problem, solved.way))
     place = problem.equations.block
     dense = np.zeros((len(rows), d, problem.equations.num_blocks, d))
     for third in range(3):
@@ -104,7 +105,7 @@ def test_what_a_run_has_in_common_is_what_all_other_rows_say(seed: int) -> None:
         dense[used, :, place[used, third]] += rows[used, :, third * d : (third + 1) * d]
     dense = dense.reshape(len(rows), d, -1)
     tied = np.zeros((problem.equations.num_blocks, d))
-    tied[problem.drawn.roots] = problem.root_weight(turn_weight, state)
+    tied[problem.drawn.roots] = root_weight(problem, turn_weight, state)
     step = solved.factor.fit(solved.left)
     square = unlikely_offsets(pose)
     for run in range(problem.num_runs):

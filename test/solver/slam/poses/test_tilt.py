@@ -13,6 +13,7 @@ from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver import solve
+from rotavg_ros.solver.slam.poses.row_errors import bent
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.view_graph import ViewGraph
 
@@ -68,7 +69,7 @@ def test_bends_about_the_vertical_are_sums_of_crossed_levers() -> None:
     whole = (d**2).sum(axis=(1, 2))[:, None, None] * np.eye(3) - d.transpose(0, 2, 1) @ d
     made = way.bridge.copy()
     made[: len(whole)] = whole
-    about, other = problem.bent(replace(way, bridge=made))
+    about, other = bent(problem, replace(way, bridge=made))
     crossed = np.cross(d, problem.drift_axis)
     np.testing.assert_allclose(about, crossed.transpose(0, 2, 1) @ crossed, atol=1e-9)
     np.testing.assert_allclose(about + other, whole, atol=1e-9)

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rotavg_ros.solver.slam.poses.closures import Places
-from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.row_errors import own_variance
 from rotavg_ros.solver.slam.poses.state import PoseNoise, PoseState
 
 # Largest factor by which variances change from solve to solve; maximum number of solves for which most variances are
@@ -107,7 +108,7 @@ def following(
         square_length: ``(C,)`` m², squared lengths of closures.
         before, after: all variances.
     """
-    shift = problem.own_variance(before, square_length) / problem.own_variance(after, square_length)
+    shift = own_variance(problem, before, square_length) / own_variance(problem, after, square_length)
     turn = before.closure_turn / after.closure_turn
     return replace(places, weight=places.weight * shift, rotation_weight=places.rotation_weight * turn)
 

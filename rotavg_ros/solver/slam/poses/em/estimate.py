@@ -16,6 +16,7 @@ from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.sparse.block_system import BlockFactor
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.poses.closures import ANYHOW, Places, Predictions, Scale
+from rotavg_ros.solver.slam.poses.displacements import Displacements
 from rotavg_ros.solver.slam.poses.em.convergence import (
     HELD,
     TO_REST,
@@ -28,12 +29,21 @@ from rotavg_ros.solver.slam.poses.em.convergence import (
     with_noise,
 )
 from rotavg_ros.solver.slam.poses.em.evidence import translation_cost
-from rotavg_ros.solver.slam.poses.em.noise import likeliest_noise, log_noise_prior
+from rotavg_ros.solver.slam.poses.em.noise import likeliest_closure_shape, likeliest_noise, log_noise_prior
 from rotavg_ros.solver.slam.poses.em.start import MAX_SOLVES, USUAL, Level, PoseStart, along_odometry
-from rotavg_ros.solver.slam.poses.even_shifts import shape_change
+from rotavg_ros.solver.slam.poses.even.shifts import shape_change
 from rotavg_ros.solver.slam.poses.places.judge import Judge
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
-from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.row_errors import (
+    closure_turns,
+    even_shifts,
+    own_variance,
+    shift_covariance,
+    stated_variance,
+    turn_variances,
+)
+from rotavg_ros.solver.slam.poses.rows import jacobian, residuals, root_weight, whitening
 from rotavg_ros.solver.slam.poses.solved import PoseMode, Solved
 from rotavg_ros.solver.slam.poses.state import PoseState
 
@@ -90,7 +100,7 @@ def estimate_poses(
         if number == most or ending.is_early(number, after, is_at_rest=is_at_rest):
             break
         is_held = ending.held_for is not None or number <= held
-        shape = problem.likeliest_shape(state.shape, solved.places.along_body)
+        shape = likeliest_closure_shape(problem, state.shape, solved.places.along_body)
         rests = noise_rests(np.append(noise - state.noise.logarithms, shape_change(shape, state.shape)))
         if number > held and is_at_rest and rests:
             if judge.counts_tails == counts_tails:
@@ -102,7 +112,7 @@ def estimate_poses(
         places = following(after, problem, solved.scale.square_length, solved.state.noise, state.noise)
     if not hold:
         return PoseMode(problem, solved, math.nan, first)
-    used = problem.closure_turns(solved.state.noise)
+    used = closure_turns(problem, solved.state.noise)
     judge = replace(judge, told=replace(judge.told, rotation_variance=used))
     in_order = judge(solved.predictions, solved.maps, solved.places.chance, solved.scale, in_order=True)
     return PoseMode(problem, solved, translation_cost(problem, solved, in_order), first)
@@ -116,49 +126,30 @@ def judge_of(problem: PoseProblem, held: np.ndarray | None = None) -> Judge:
 
 def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge) -> Solved:
     """One Gauss–Newton step, and the classes of closures that follow from it."""
-    closure, k, num_nodes = problem.mode.problem.closure, problem.turns, problem.drawn.num_nodes
+    closure = problem.mode.problem.closure
     way = problem.displacements(problem.orientations(state))
-    residual, covariance = problem.residuals(state, way), problem.shift_covariance(state, way)
-    turn_variances = problem.turn_variances(state.noise)
-    rotation_weight = 1 / turn_variances
+    covariance, turned = shift_covariance(problem, state, way), turn_variances(problem, state.noise)
+    rotation_weight = 1 / turned
     rotation_weight[closure] = places.rotation_weight[:, None]
-    spend(_ROW * len(turn_variances))
-    root = problem.whitening(covariance, rotation_weight, places.closure_root, state)
-    jacobian = np.matmul(root, problem.jacobian(way))
-    factor = problem.equations.factorise(jacobian, problem.root_weight(rotation_weight, state))
-    whitened = np.matmul(root, residual[:, :, None])
+    spend(_ROW * len(turned))
+    root = whitening(problem, covariance, rotation_weight, places.closure_root, state)
+    rows = np.matmul(root, jacobian(problem, way))
+    factor = problem.equations.factorise(rows, root_weight(problem, rotation_weight, state))
+    whitened = np.matmul(root, residuals(problem, state, way)[:, :, None])
     step = factor.fit(whitened)
-    turns, shifts = problem.bases
-    moved = np.concatenate((step[:, :k, 0] @ turns.T, step[:, k:, 0] @ shifts.T), axis=1)
-    turned = float(np.abs(moved[:num_nodes, :3]).max(initial=0.0))
-    moved /= max(1.0, turned / _MAX_TURN)
-    correction = quaternion_rows.multiply(state.correction, quaternion_rows.exp(moved[:num_nodes, :3].T))
-    state = replace(
-        state,
-        correction=quaternion_rows.normalize(correction),
-        position=state.position + moved[:num_nodes, 3:],
-        common=state.common + moved[num_nodes:],
-    )
-    explained = factor.predicted(step)
+    state, explained = _after(problem, state, step[:, :, 0]), factor.predicted(step)
     left = whitened - explained
     # xᵀ H x of the step x; for x ~ N(0, H⁻¹) its expectation is the number of unknowns.
     moved_by = math.sqrt(float((explained**2).sum()) / max(step.size, 1))
-    extent = _extent(problem, state)
     # Variance of a closure's shift if neither the place of its source nor its orientation is known.
-    anywhere = extent + problem.stated_square
-    spend(_ROW * len(jacobian))
-    predictions = _left_out(factor, root, left, closure).within(k, ANYHOW, anywhere)
-    stated = state.noise.of_closures(problem.stated_square)
-    square_length = known_square = problem.stated_square
-    if "expected-lengths" not in problem.mode.problem.without:
-        told = way.displacement[closure] @ shifts
-        square_length = predictions.square_length(told, stated)
-        known_square = np.minimum(square_length, predictions.square_length_known(told))
-    scale = replace(_scale(problem, state, square_length), known_square=known_square)
-    judge = replace(judge, told=replace(judge.told, rotation_variance=turn_variances[closure, 0]))
-    spend(_ROW * len(jacobian))
-    maps = MapTurns.of(problem, state.position, predictions, problem.stated_variance(state))
-    spend(_ROW * len(jacobian))
+    anywhere = _extent(problem, state) + problem.stated_square
+    spend(_ROW * len(rows))
+    predictions = _left_out(factor, root, left, closure).within(problem.turns, ANYHOW, anywhere)
+    scale = _expected_scale(problem, state, predictions, way)
+    judge = replace(judge, told=replace(judge.told, rotation_variance=turned[closure, 0]))
+    spend(_ROW * len(rows))
+    maps = MapTurns.of(problem, state.position, predictions, stated_variance(problem, state))
+    spend(_ROW * len(rows))
     judged = judge(predictions, maps, places.chance, scale)
     return Solved(
         state,
@@ -174,6 +165,21 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
         predictions,
         maps,
         judged,
+    )
+
+
+def _after(problem: PoseProblem, state: PoseState, step: np.ndarray) -> PoseState:
+    """The state after a step ``(K + R, d)``, which is shortened where a node would turn too far."""
+    k, num_nodes, (turns, shifts) = problem.turns, problem.drawn.num_nodes, problem.bases
+    moved = np.concatenate((step[:, :k] @ turns.T, step[:, k:] @ shifts.T), axis=1)
+    farthest = float(np.abs(moved[:num_nodes, :3]).max(initial=0.0))
+    moved /= max(1.0, farthest / _MAX_TURN)
+    correction = quaternion_rows.multiply(state.correction, quaternion_rows.exp(moved[:num_nodes, :3].T))
+    return replace(
+        state,
+        correction=quaternion_rows.normalize(correction),
+        position=state.position + moved[:num_nodes, 3:],
+        common=state.common + moved[num_nodes:],
     )
 
 
@@ -201,7 +207,7 @@ def _log_likely(problem: PoseProblem, solved: Solved) -> float:
 
 def _nothing_known(problem: PoseProblem, state: PoseState, judge: Judge) -> Places:
     closure = problem.mode.problem.closure
-    residual = problem.residuals(state, problem.displacements(problem.orientations(state)))
+    residual = residuals(problem, state, problem.displacements(problem.orientations(state)))
     square, scale = (residual[closure, problem.turns :] ** 2).sum(axis=1), _scale(problem, state, problem.stated_square)
     return judge.nothing_known(problem.mode.state.is_good[closure], square, scale)
 
@@ -214,14 +220,24 @@ def _extent(problem: PoseProblem, state: PoseState) -> float:
 
 def _scale(problem: PoseProblem, state: PoseState, square_length: np.ndarray) -> Scale:
     """Scales for closures between places that are ``square_length (C,)`` m² apart."""
-    extent, own = _extent(problem, state), problem.own_variance(state.noise, square_length)
+    extent, own = _extent(problem, state), own_variance(problem, state.noise, square_length)
     # A closure may state an absurd length, for which Gaussians of the map's extent would not distinguish its classes.
     anywhere = np.maximum(extent, problem.stated_square / problem.shifts)
     # Errors in proportion to the length, and those that others share with their runs, are alike along all axes.
     share = state.noise.closure / own
-    shape = problem.even_shifts(state, share)
+    shape = even_shifts(problem, state, share)
     good = state.noise.of_closures(square_length) + (shape.size - 1) * own
     return Scale(good, shape.size * own, share, extent, anywhere, square_length, square_length, shape)
+
+
+def _expected_scale(problem: PoseProblem, state: PoseState, predictions: Predictions, way: Displacements) -> Scale:
+    """Scales of closures' errors for the lengths that are expected of closures, given these and all else."""
+    if "expected-lengths" in problem.mode.problem.without:
+        return _scale(problem, state, problem.stated_square)
+    told = way.displacement[problem.mode.problem.closure] @ problem.bases[1]
+    square_length = predictions.square_length(told, state.noise.of_closures(problem.stated_square))
+    known_square = np.minimum(square_length, predictions.square_length_known(told))
+    return replace(_scale(problem, state, square_length), known_square=known_square)
 
 
 def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.ndarray) -> Predictions:

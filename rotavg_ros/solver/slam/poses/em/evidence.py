@@ -6,8 +6,10 @@ import numpy as np
 
 from rotavg_ros.solver.slam.poses.closures import Places
 from rotavg_ros.solver.slam.poses.em.noise import log_noise_prior
-from rotavg_ros.solver.slam.poses.even_shifts import log_shape_prior
-from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.even.shifts import log_shape_prior
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.row_errors import closure_turns, common_turn, initial_noise
+from rotavg_ros.solver.slam.poses.rows import jacobian, loose_weight, root_weight, whitening
 from rotavg_ros.solver.slam.poses.solved import Solved
 
 
@@ -24,7 +26,7 @@ def translation_cost(problem: PoseProblem, solved: Solved, in_order: Places) -> 
         in_order: classes of closures given only those before.
     """
     gained = in_order.log_density - _as_normal(problem, solved) - _gained_by_rotations(problem)
-    believed = log_noise_prior(problem, solved.state.noise) - log_noise_prior(problem, problem.turn_noise)
+    believed = log_noise_prior(problem, solved.state.noise) - log_noise_prior(problem, initial_noise(problem))
     believed += log_shape_prior(problem.bases[1].T @ solved.state.shape @ problem.bases[1])
     return _normal(problem, solved) - _normal_of_rotations(problem) - float(gained.sum()) - believed
 
@@ -40,7 +42,7 @@ def _normal(problem: PoseProblem, solved: Solved) -> float:
         float(np.log(solved.closure_weight).sum()) * m + float(np.log(solved.rotation_weight).sum(axis=0) @ components)
     ) / 2
     cost += m / 2 * problem.num_runs * float(np.log(solved.state.noise.common))
-    cost += k / 2 * problem.num_runs * float(np.log(problem.common_turn(solved.state.noise)))
+    cost += k / 2 * problem.num_runs * float(np.log(common_turn(problem, solved.state.noise)))
     # Rows minus unknowns, per component of a shift; loose nodes have a prior.
     redundant = len(drawn.source) - drawn.num_nodes + len(drawn.roots) + len(problem.loose)
     return cost + m / 2 * redundant * float(np.log(2 * np.pi))
@@ -51,10 +53,9 @@ def _log_det(problem: PoseProblem, solved: Solved) -> float:
     if len(problem.loose) == 0:
         return solved.factor.log_det
     state = solved.state
-    root = problem.whitening(solved.covariance, solved.rotation_weight, solved.closure_root, state)
-    jacobian = np.matmul(root, problem.jacobian(solved.way))
-    root_weight = problem.root_weight(solved.rotation_weight, state)
-    return problem.equations.factorise(jacobian, root_weight, problem.loose_weight(solved.scale.extent)).log_det
+    root = whitening(problem, solved.covariance, solved.rotation_weight, solved.closure_root, state)
+    rows, tied = np.matmul(root, jacobian(problem, solved.way)), root_weight(problem, solved.rotation_weight, state)
+    return problem.equations.factorise(rows, tied, loose_weight(problem, solved.scale.extent)).log_det
 
 
 def _normal_of_rotations(problem: PoseProblem) -> float:
@@ -86,6 +87,6 @@ def _gained_by_rotations(problem: PoseProblem) -> np.ndarray:
         return np.asarray(-(square / variance + k * np.log(2 * np.pi * variance)) / 2)
 
     is_good = problem.mode.state.is_good[closure]
-    own = log_normal(problem.closure_turns(problem.turn_noise) + predicted)
+    own = log_normal(closure_turns(problem, initial_noise(problem)) + predicted)
     stands = log_normal(1 / problem.mode.evaluation.weight[closure] + predicted)
     return np.asarray(np.where(is_good, own, problem.told.false_odds) - stands)

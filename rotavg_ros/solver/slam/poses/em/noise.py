@@ -9,7 +9,9 @@ import numpy as np
 
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.slam.noise.vertical import LEAST_TILT, TILT_SPREAD
-from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.even.shifts import likeliest_shape
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.row_errors import bent, mean_closure_shift
 from rotavg_ros.solver.slam.poses.solved import Solved
 from rotavg_ros.solver.slam.poses.state import PoseNoise
 from rotavg_ros.solver.slam.posterior.em import likeliest_variance
@@ -36,7 +38,7 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
         squares = np.matmul(pulled.transpose(0, 2, 1), np.matmul(own, pulled)).sum()
         return np.array([squares, np.trace(np.matmul(own, left_over), axis1=1, axis2=2).sum()])
 
-    bent = (problem.bent(solved.way) * problem.tailed[:, None, None])[:, segments]
+    bending = (bent(problem, solved.way) * problem.tailed[:, None, None])[:, segments]
     left, turns = solved.left[segments, :k, 0], redundancy[:, :k, :k]
 
     def by_axes(axes: np.ndarray) -> np.ndarray:
@@ -44,8 +46,8 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
         return np.array([((left @ axes) ** 2).sum(), np.trace(turns @ axes, axis1=1, axis2=2).sum()])
 
     about = problem.about_drift_axis
-    by_turns = by_shifts(noise.turn * bent[0]) + by_axes(about)
-    by_tilts = by_shifts(noise.tilt * bent[1]) + by_axes(np.eye(k) - about)
+    by_turns = by_shifts(noise.turn * bending[0]) + by_axes(about)
+    by_tilts = by_shifts(noise.tilt * bending[1]) + by_axes(np.eye(k) - about)
     by_closures = np.stack((places.squares, places.freedom), axis=1)
     runs = slice(len(problem.drawn.source), None)
     alike = (solved.left[runs, k:] ** 2).sum(), np.trace(solved.factor.redundancy[runs, k:, k:], axis1=1, axis2=2).sum()
@@ -78,6 +80,15 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     return replace(noise, common=common, way=within * noise.way, step=within * noise.step, tilt=tilt)
 
 
+def likeliest_closure_shape(problem: PoseProblem, shape: np.ndarray, along_body: np.ndarray) -> np.ndarray:
+    """``(3, 3)`` shape of closures' shifts in the body's axes, from squares and freedom ``(2, m, m)`` there."""
+    if "shift-axes" in problem.mode.problem.without:
+        return shape
+    axes = problem.bases[1]
+    found = likeliest_shape(axes.T @ shape @ axes, *along_body)
+    return np.asarray(axes @ found @ axes.T + np.eye(3) - axes @ axes.T)
+
+
 def _likeliest_growth(problem: PoseProblem, solved: Solved, prior: _Prior) -> np.ndarray:
     """``(1,)`` logarithm of the growth of closures' variance with the squared length.
 
@@ -85,7 +96,7 @@ def _likeliest_growth(problem: PoseProblem, solved: Solved, prior: _Prior) -> np
     not tell where it ends. A length that a closure's own error makes longer would explain that error.
     """
     scale, (squares, freedom) = solved.scale, solved.places.pulled
-    shaped = scale.floor_share * (problem.mean_closure_shift(solved.state.shape) - 1)
+    shaped = scale.floor_share * (mean_closure_shift(problem, solved.state.shape) - 1)
     total = scale.own / scale.shape.size * (1 + shaped)
     told, before = (squares * total**2, freedom * total), solved.state.noise.logarithms[_GROWS]
     return _likeliest_parts(told, total, scale.known_square[:, None], before, [prior])

@@ -8,7 +8,8 @@ import numpy as np
 
 from rotavg_ros.solver.slam.poses.closures import NOTHING, REPEATS, Places
 from rotavg_ros.solver.slam.poses.places.classes import CLASSES
-from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.row_errors import closure_turns, initial_noise
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.poses.state import PoseNoise, PoseState
 
@@ -61,7 +62,7 @@ class PoseStart:
         chance[:, closures] = 0.0
         chance[0, closures] = 1.0
         weight[closures] = 1 / pose.solved.scale.own[closures]
-        rotation[closures] = 1 / problem.closure_turns(noise)[closures]
+        rotation[closures] = 1 / closure_turns(problem, noise)[closures]
         begun = replace(places, chance=chance, weight=weight, rotation_weight=rotation)
         return replace(cls.at(pose), places=begun)
 
@@ -135,5 +136,5 @@ def along_odometry(problem: PoseProblem, level: Level = USUAL) -> PoseState:
     if problem.turns_share:
         common[:, :3] = mode.state.common
     nowhere = np.zeros((problem.drawn.num_nodes, 3))
-    state = PoseState(mode.state.correction, nowhere, common, problem.turn_noise.of_shifts_times(*level), np.eye(3))
+    state = PoseState(mode.state.correction, nowhere, common, initial_noise(problem).of_shifts_times(*level), np.eye(3))
     return replace(state, position=problem.along_odometry(problem.displacements(problem.orientations(state))))

@@ -12,8 +12,8 @@ import numpy as np
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.poses.closures import Predictions, Told
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.repeats.map_turn_densities import Axes, closure_rows, repeated_after, repeated_density
-from rotavg_ros.solver.slam.poses.rows import PoseProblem
 
 # Closures that join wrong, turned places with less than this probability are no evidence.
 _LEAST_CHANCE = 0.01

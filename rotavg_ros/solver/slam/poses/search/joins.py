@@ -15,6 +15,7 @@ import numpy as np
 from rotavg_ros.solver.running.work import rest, stop_if_abandoned
 from rotavg_ros.solver.slam.graph.evenly import evenly
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
+from rotavg_ros.solver.slam.poses.row_errors import stated_variance
 from rotavg_ros.solver.slam.poses.search.settling import LEAST_GAIN, Rival, moved
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 
@@ -75,7 +76,7 @@ def other_joins(pose: PoseMode) -> list[Join]:
     sign = np.where(chain[could, 0] < chain[could, 1], 1.0, -1.0)
     shift = sign[:, None] * pose.solved.predictions.mean[could, k:]
     spread = np.diagonal(pose.solved.predictions.covariance[could][:, k:, k:], axis1=1, axis2=2).mean(axis=1)
-    variance = spread + problem.stated_variance(pose.state)[could]
+    variance = spread + stated_variance(problem, pose.state)[could]
     pair = np.sort(chain[could], axis=1)
     square = ((shift[:, None] - shift[None]) ** 2).sum(axis=2) / (variance[:, None] + variance[None])
     alike = (square < _ALIKE**2 * shift.shape[1]) & (pair[:, None] == pair[None]).all(axis=2)

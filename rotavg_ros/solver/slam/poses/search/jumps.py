@@ -16,8 +16,9 @@ from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.poses.closures import given_turn
 from rotavg_ros.solver.slam.poses.em.estimate import judge_of
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.repeats.neighbours import log_places
-from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.row_errors import stated_variance
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.labels.prior import log_slip_prior
 
@@ -181,7 +182,7 @@ class _Witnesses:
         problem, solved = pose.problem, pose.solved
         mode, told, drawn, k = problem.mode.problem, problem.told, problem.drawn, problem.turns
         here = given_turn(solved.predictions, told.rotation_variance, k)
-        own = problem.stated_variance(pose.state)
+        own = stated_variance(problem, pose.state)
         total = here.spread + own[:, None]
         log_here = here.log_turn - np.log(2 * np.pi * total).sum(axis=1) / 2
         places = solved.places

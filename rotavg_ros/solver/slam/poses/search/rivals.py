@@ -10,7 +10,8 @@ import numpy as np
 from rotavg_ros.solver.slam.poses.em.convergence import HELD, Ending
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses, likeliest_level
 from rotavg_ros.solver.slam.poses.em.start import USUAL, PoseStart
-from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.row_errors import initial_noise
 from rotavg_ros.solver.slam.poses.search.joins import joined_otherwise
 from rotavg_ros.solver.slam.poses.search.jumps import jumps_too_far, likeliest_jump, with_jump, without_odd_jumps
 from rotavg_ros.solver.slam.poses.search.runs import with_runs, without_runs
@@ -123,7 +124,7 @@ def _jumping(rival: Rival) -> list[Rival]:
     # Closures that pull across a jump bend the map until right ones seem wrong, or odometry's variance grows until
     # nothing does. So jumps are also looked for before closures pull, and before variances grow.
     typical = np.array([before.typical, 1.0])
-    has_grown = rival.pose.state.noise.of_odometry(typical) > before.turn_noise.of_odometry(typical)
+    has_grown = rival.pose.state.noise.of_odometry(typical) > initial_noise(before).of_odometry(typical)
     for solves in (1, HELD) if has_grown else (1,):
         jumped = _with_jumps(estimate_poses(before, ending=Ending(held_for=solves)))
         if jumped.problem is not before and not any(jumped.jumps_like(other.pose) for other in begun):

@@ -22,6 +22,8 @@ from rotavg_ros.solver.running.work import rest, stop_if_abandoned
 from rotavg_ros.solver.slam.poses.em.estimate import judge_of
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.repeats.neighbours import log_all_right
+from rotavg_ros.solver.slam.poses.row_errors import closure_turns, stated_variance
+from rotavg_ros.solver.slam.poses.rows import jacobian
 from rotavg_ros.solver.slam.poses.search.settling import LEAST_GAIN, SLACK, Rival, moved
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 
@@ -116,7 +118,7 @@ def _nearest(pose: PoseMode, could: np.ndarray) -> list[np.ndarray]:
     count = np.bincount(told.run, could)
     off = np.stack([np.bincount(told.run, could * told.sign * column) for column in predictions.mean.T], axis=1)
     spread = np.diagonal(predictions.covariance, axis1=1, axis2=2)
-    good = pose.problem.stated_variance(pose.state)
+    good = stated_variance(pose.problem, pose.state)
     own = np.stack((told.rotation_variance, good), axis=1)
     total = spread + np.repeat(own, [k, spread.shape[1] - k], axis=1)
     variance = np.stack([np.bincount(told.run, could * column) for column in total.T], axis=1)
@@ -180,8 +182,8 @@ def _discrepancies(pose: PoseMode, members: np.ndarray) -> tuple[np.ndarray, np.
     """Covariance ``(K d, K d)`` of the discrepancies of K closures if they are right, and these ``(K d,)``."""
     problem, solved, k = pose.problem, pose.solved, pose.problem.turns
     rows, d = problem.mode.problem.closure[members], problem.turns + problem.shifts
-    own = np.repeat(problem.closure_turns(pose.state.noise)[members, None], d, axis=1)
+    own = np.repeat(closure_turns(problem, pose.state.noise)[members, None], d, axis=1)
     shared = np.where(problem.run[problem.mode.problem.closure] >= 0, pose.state.noise.common, 0.0)
-    own[:, k:] = (problem.stated_variance(pose.state) - shared)[members, None]
-    total = solved.factor.covariance_between(problem.jacobian(solved.way)[rows], rows) + np.diag(own.ravel())
+    own[:, k:] = (stated_variance(problem, pose.state) - shared)[members, None]
+    total = solved.factor.covariance_between(jacobian(problem, solved.way)[rows], rows) + np.diag(own.ravel())
     return total, solved.predictions.mean[members].ravel()

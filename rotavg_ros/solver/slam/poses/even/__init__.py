@@ -1,0 +1,1 @@
+"""Units in which errors are alike along all axes."""
