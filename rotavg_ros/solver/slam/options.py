@@ -42,6 +42,7 @@ SWITCHES: dict[str, str] = {
     "jumps": "odometry's position does not jump while its heading stays right",
     "believed-runs": "closures of a run that make each other seem to join wrong places are believed only one at a time",
     "doubted-runs": "closures of a run that bend the map until they fit are doubted only one at a time",
+    "other-beginnings": "no estimate of poses begins once more at closures that were rejected",
     "relabelling": "with translations, rival answers are compared under the labels that rotations alone gave them",
     "rivals": "only the best labelling is published",
 }

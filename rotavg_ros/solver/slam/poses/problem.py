@@ -230,6 +230,12 @@ class PoseProblem:
         return np.asarray(self.drawn.view_graph_edge[self.mode.problem.closure - self.drawn.num_segments])
 
     @cached_property
+    def within_chain(self) -> np.ndarray:
+        """``(C,)`` bool, closures whose ends odometry joins."""
+        drawn, closure = self.drawn, self.mode.problem.closure
+        return np.asarray(drawn.chain[drawn.source[closure]] == drawn.chain[drawn.target[closure]])
+
+    @cached_property
     def stated_square(self) -> np.ndarray:
         """``(C,)`` m², squared lengths that closures state."""
         return np.asarray((self.lengths[self.closures] ** 2).sum(axis=1))

@@ -122,10 +122,23 @@ def test_floors_stay_apart(seed: int) -> None:
     check(building(seed), 0.6)
 
 
-@pytest.mark.large
-def test_gravity_tells_floors_apart() -> None:
-    """Most closures of upper floors are of another one, but odometry that hardly tilts does not lose a floor."""
-    made = building(1, false_share=0.65, tilts=0.05)
-    assert made.is_false.mean() > 0.4
-    assert false_kept(made, "neurora~tilt") > 20
+@pytest.mark.parametrize("seed", [4, *(pytest.param(seed, marks=pytest.mark.large) for seed in (5, 12))])
+def test_closures_that_were_believed_first_need_not_be_right(seed: int) -> None:
+    """Those of another floor pulled first, all of a right run seemed wrong because of them."""
+    made = building(seed, false_share=0.5 if seed == 12 else 0.65, tilts=0.05)
+    assert false_kept(made, "neurora~other-beginnings") > 20
     check(made, 0.4)
+
+
+@pytest.mark.large
+def test_gravity_makes_positions_better() -> None:
+    """Odometry that hardly tilts hardly loses height."""
+    ratios = []
+    for seed in range(4):
+        made = building(seed, false_share=0.65, tilts=0.05)
+        check(made, 0.4)
+        found = [solve(made.graph, method=method).position for method in ("neurora", "neurora~tilt")]
+        errors = [position_errors(position.numpy(), made.position) for position in found if position is not None]
+        known, unknown = (np.sqrt((each**2).mean()) for each in errors)
+        ratios.append(known / unknown)
+    assert np.exp(np.log(ratios).mean()) < 0.9

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros import ViewGraph
+from rotavg_ros import ViewGraph, solve
+from rotavg_ros.metrics.positions import position_errors
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.search.joins import joined_otherwise, other_joins
@@ -24,7 +26,7 @@ BLOCK, SIDE, LENGTH = 15, 60, 280
 
 
 class Streets(NamedTuple):
-    """Two robots' graph, the true positions, and which edges are false or join the robots."""
+    """Robots' graph, the true positions, and which edges are false or join the robots."""
 
     graph: ViewGraph
     position: np.ndarray
@@ -32,11 +34,11 @@ class Streets(NamedTuple):
     joins: np.ndarray
 
 
-def two_in_a_town(seed: int, good: int = 5, false: int = 3) -> Streets:
-    """Two robots on the same streets, each with loops of its own; a run of false joins agrees on one displacement."""
+def in_a_town(seed: int, robots: int = 2, good: int = 5, false: int = 3) -> Streets:
+    """Robots on the same streets, each with loops of its own; of each two a run of false joins agrees on one shift."""
     rng = np.random.default_rng(seed)
     turns, places = [], []
-    for _ in range(2):
+    for _ in range(robots):
         place, heading, at = [], [], np.array(rng.integers(0, SIDE // BLOCK + 1, 2) * BLOCK)
         while len(place) < LENGTH:
             ways = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
@@ -57,7 +59,7 @@ def two_in_a_town(seed: int, good: int = 5, false: int = 3) -> Streets:
         shift = turn[i].inv().apply(seen - position[i]) + np.append(rng.normal(0, noise_m, 2), 0.0)
         edges.append((i, j, turn[i].inv() * turn[j] * error, shift, kind, moved is not None))
 
-    for first in (0, LENGTH):
+    for first in LENGTH * np.arange(robots):
         for i in range(first, first + LENGTH - 1):
             add(i, i + 1, 0.3, 0.03, EdgeKind.ODOMETRY)
         own = position[first : first + LENGTH]
@@ -65,14 +67,16 @@ def two_in_a_town(seed: int, good: int = 5, false: int = 3) -> Streets:
         pairs = pairs[pairs[:, 1] - pairs[:, 0] > 40] + first
         for i, j in pairs[rng.choice(len(pairs), min(30, len(pairs)), replace=False)]:
             add(i, j, 0.8, 0.08, EdgeKind.LOOP_CLOSURE)
-    apart = np.linalg.norm(position[:LENGTH, None] - position[LENGTH:], axis=2)
-    near = np.argwhere(apart < 2)
-    for i, j in near[rng.choice(len(near), good, replace=False)]:
-        add(i, LENGTH + j, 0.8, 0.08, EdgeKind.LOOP_CLOSURE)
-    far = np.argwhere(apart[:-false, :-false] > 20)
-    i, j = far[rng.integers(len(far))]
-    for step in range(false):
-        add(i + step, LENGTH + j + step, 0.8, 0.08, EdgeKind.LOOP_CLOSURE, position[i] - position[LENGTH + j])
+    for one, other in combinations(range(robots), 2):
+        apart = np.linalg.norm(places[one][:, None] - places[other], axis=2)
+        near = np.argwhere(apart < 2)
+        for i, j in near[rng.permutation(len(near))[:good]]:
+            add(one * LENGTH + i, other * LENGTH + j, 0.8, 0.08, EdgeKind.LOOP_CLOSURE)
+        far = np.argwhere(apart[:-false, :-false] > 20)
+        i, j = far[rng.integers(len(far))]
+        moved = places[one][i] - places[other][j]
+        for step in range(false):
+            add(one * LENGTH + i + step, other * LENGTH + j + step, 0.8, 0.08, EdgeKind.LOOP_CLOSURE, moved)
     source, target, rotation, translation, kind, is_false = zip(*edges, strict=True)
     graph = ViewGraph.create(
         source,
@@ -81,7 +85,7 @@ def two_in_a_town(seed: int, good: int = 5, false: int = 3) -> Streets:
         translation=np.array(translation),
         kind=kind,
     )
-    return Streets(graph, position, np.array(is_false), (np.array(source) < LENGTH) & (np.array(target) >= LENGTH))
+    return Streets(graph, position, np.array(is_false), np.array(source) // LENGTH != np.array(target) // LENGTH)
 
 
 def placed_by_false(streets: Streets) -> Rival:
@@ -95,7 +99,7 @@ def placed_by_false(streets: Streets) -> Rival:
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.large) for seed in range(1, 6))])
 def test_a_robot_is_placed_by_the_joins_that_make_all_likelier(seed: int) -> None:
-    streets = two_in_a_town(seed)
+    streets = in_a_town(seed)
     rival = placed_by_false(streets)
     edge = rival.pose.problem.closures
     false, good = streets.is_false[edge], streets.joins[edge] & ~streets.is_false[edge]
@@ -111,8 +115,22 @@ def test_a_robot_is_placed_by_the_joins_that_make_all_likelier(seed: int) -> Non
     assert joined_otherwise(placed) is placed
 
 
+@pytest.mark.parametrize(
+    ("robots", "good", "false", "seed"), [(4, 2, 3, 2), pytest.param(4, 3, 5, 1, marks=pytest.mark.large)]
+)
+def test_a_fleet_is_placed_though_each_pair_has_more_false_joins_than_good_ones(
+    robots: int, good: int, false: int, seed: int
+) -> None:
+    """Of each two robots good joins are of more runs, and only what they contradict has to be wrong."""
+    streets = in_a_town(seed, robots, good, false)
+    solution = solve(streets.graph)
+    assert ((solution.outlier_score.numpy() > 0.5) == streets.is_false).all()
+    assert solution.position is not None
+    assert position_errors(solution.position.numpy(), streets.position).mean() < 0.5
+
+
 def test_one_chain_has_no_joins() -> None:
-    streets = two_in_a_town(0)
+    streets = in_a_town(0)
     first = np.flatnonzero((streets.graph.source.numpy() < LENGTH) & (streets.graph.target.numpy() < LENGTH))
     alone = replace(streets.graph.select_edges(torch.from_numpy(first)), num_nodes=LENGTH)
     assert other_joins(pose_mode(alone)) == []

@@ -77,9 +77,9 @@ def estimate_poses(
     is_good = problem.mode.state.is_good[problem.mode.problem.closure]
     judge = judge_of(problem, is_good if hold else None)
     state = along_odometry(problem, level) if start is None else start.state
-    places, is_new = _nothing_known(problem, state, judge), np.ones(len(is_good), dtype=bool)
+    places, at_once = _nothing_known(problem, state, judge), np.ones(len(is_good), dtype=bool)
     if start is not None:
-        places, is_new = start.over(places), start.column < 0
+        places, at_once = start.over(places), (start.column < 0) & (not start.is_gradual)
     change, sorted_by = np.zeros(len(state.noise.logarithms)), np.zeros_like(places.chance)
     pace = Pace.of(len(is_good))
     number, held, most = 0, *((HELD, MAX_SOLVES) if start is None else (0, start.solves))
@@ -90,7 +90,7 @@ def estimate_poses(
             first = _log_likely(problem, solved)
         spend(_ROW * len(solved.left))
         chance, sorted_by = damped(solved.places.chance, places.chance, sorted_by)
-        after, pace = pace.towards(replace(solved.places, chance=chance), places, is_new & (number == 0))
+        after, pace = pace.towards(replace(solved.places, chance=chance), places, at_once & (number == 0))
         noise = likeliest_noise(problem, solved).logarithms
         spend(_ROW * len(solved.left))
         is_at_rest = poses_rest(solved.moved, after, places)

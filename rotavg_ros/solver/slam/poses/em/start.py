@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from rotavg_ros.solver.slam.poses.closures import NOTHING, REPEATS, Places
+from rotavg_ros.solver.slam.poses.closures import NOTHING, REPEATS, Places, Scale
 from rotavg_ros.solver.slam.poses.places.classes import CLASSES
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.row_errors import closure_turns, initial_noise
@@ -30,12 +30,14 @@ class PoseStart:
         column: ``(C,)`` index of each closure in ``places``, -1 for new closures.
         places: classes as they were judged.
         solves: maximum number of solves from there.
+        is_gradual: whether new closures begin to pull little by little, not at once.
     """
 
     state: PoseState
     column: np.ndarray
     places: Places
     solves: int = _MAX_UPDATE_SOLVES
+    is_gradual: bool = False
 
     @classmethod
     def at(cls, pose: PoseMode) -> PoseStart:
@@ -57,14 +59,18 @@ class PoseStart:
     @classmethod
     def believing(cls, pose: PoseMode, closures: np.ndarray) -> PoseStart:
         """For the same labelling, with some closures ``(n,)`` believed."""
-        problem, noise, places = pose.problem, pose.state.noise, pose.solved.places
-        chance, weight, rotation = places.chance.copy(), places.weight.copy(), places.rotation_weight.copy()
-        chance[:, closures] = 0.0
-        chance[0, closures] = 1.0
-        weight[closures] = 1 / pose.solved.scale.own[closures]
-        rotation[closures] = 1 / closure_turns(problem, noise)[closures]
-        begun = replace(places, chance=chance, weight=weight, rotation_weight=rotation)
+        begun = with_believed(pose.problem, pose.solved.places, closures, pose.state.noise, pose.solved.scale)
         return replace(cls.at(pose), places=begun)
+
+    @classmethod
+    def anew(cls, pose: PoseMode, closures: np.ndarray) -> PoseStart:
+        """For the same labelling, from rotations alone, with some closures ``(n,)`` believed.
+
+        All others begin to pull little by little.
+        """
+        begun, column = cls.believing(pose, closures), np.full(len(pose.solved.places.weight), -1)
+        column[closures] = closures
+        return replace(begun, state=along_odometry(pose.problem), column=column, is_gradual=True)
 
     @classmethod
     def doubting(cls, pose: PoseMode, closures: np.ndarray) -> PoseStart:
@@ -127,6 +133,16 @@ class PoseStart:
             rotation_weight=np.where(is_new, places.rotation_weight, self.places.rotation_weight[column]),
             even=np.where(is_new[:, None, None], places.even, even[column]),
         )
+
+
+def with_believed(problem: PoseProblem, places: Places, closures: np.ndarray, noise: PoseNoise, scale: Scale) -> Places:
+    """Places in which some closures ``(n,)`` are believed, and pull as right ones do."""
+    chance, weight, rotation = places.chance.copy(), places.weight.copy(), places.rotation_weight.copy()
+    chance[:, closures] = 0.0
+    chance[0, closures] = 1.0
+    weight[closures] = 1 / scale.own[closures]
+    rotation[closures] = 1 / closure_turns(problem, noise)[closures]
+    return replace(places, chance=chance, weight=weight, rotation_weight=rotation)
 
 
 def along_odometry(problem: PoseProblem, level: Level = USUAL) -> PoseState:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rotavg_ros.solver.running.work import rest, stop_if_abandoned
+from rotavg_ros.solver.slam.graph.chain_cuts import ChainCuts, with_most_runs
 from rotavg_ros.solver.slam.graph.evenly import evenly
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.row_errors import stated_variance
@@ -22,8 +23,8 @@ from rotavg_ros.solver.slam.poses.solved import PoseMode
 _WRONG = 0.5
 # Two closures agree about where a chain lies if they differ by less than this many standard deviations.
 _ALIKE = 3.0
-# Maximum number of rounds; of joins that are tried in each, those of most closures first; and of closures compared.
-_MAX_ROUNDS, _MAX_JOINS, _MAX_COMPARED = 4, 8, 1000
+# Maximum number of rounds; of joins that are tried in each, those of most runs first; and of closures compared.
+_MAX_ROUNDS, _MAX_JOINS, _MAX_COMPARED = 8, 8, 1000
 
 
 class Join(NamedTuple):
@@ -31,7 +32,7 @@ class Join(NamedTuple):
 
     Attributes:
         believed: closures that agree about where one lies beside the other.
-        doubted: all other closures that join one of the two to any chain.
+        doubted: closures without which nothing else joins the two.
     """
 
     believed: np.ndarray
@@ -39,30 +40,23 @@ class Join(NamedTuple):
 
 
 def joined_otherwise(rival: Rival) -> Rival:
-    """The same labelling with chains placed by other closures, one after the other, as long as −log p falls."""
+    """The same labelling with chains placed by other closures, by those first that make all likeliest."""
     if "joins" in rival.mode.problem.without:
         return rival
-    tried: set[bytes] = set()
     for _ in range(_MAX_ROUNDS):
-        for join in other_joins(rival.pose):
-            key = join.believed.tobytes() + b"|" + join.doubted.tobytes()
-            if key in tried:
-                continue
-            tried.add(key)
-            placed = moved(rival, PoseStart.joining(rival.pose, *join))
-            if placed.cost < rival.cost - LEAST_GAIN:
-                rival = placed
-                break
-        else:
+        placed = [moved(rival, PoseStart.joining(rival.pose, *join)) for join in other_joins(rival.pose)]
+        likeliest = min(placed, key=lambda each: each.cost, default=rival)
+        if not likeliest.cost < rival.cost - LEAST_GAIN:
             break
+        rival = likeliest
     return rival
 
 
 def other_joins(pose: PoseMode) -> list[Join]:
-    """Groups of closures that would place a chain otherwise than it lies, those of most closures first.
+    """Groups of closures that would place a chain otherwise than it lies, those of most runs first.
 
-    Either chain may be the one that is misplaced, so a group may be there twice; not where it has fewer runs than the
-    closures that would have to be wrong.
+    What joins the two chains otherwise may be wrong where it is of fewest runs, or at either chain, so a group may be
+    there several times; not where it has fewer runs than the closures that would have to be wrong.
     """
     problem, places, told = pose.problem, pose.solved.places, pose.problem.told
     closure, drawn, k = problem.mode.problem.closure, problem.drawn, problem.turns
@@ -80,19 +74,24 @@ def other_joins(pose: PoseMode) -> list[Join]:
     pair = np.sort(chain[could], axis=1)
     square = ((shift[:, None] - shift[None]) ** 2).sum(axis=2) / (variance[:, None] + variance[None])
     alike = (square < _ALIKE**2 * shift.shape[1]) & (pair[:, None] == pair[None]).all(axis=2)
+    names, ends = np.unique(chain[joins], return_inverse=True)
+    ends, is_believed = ends.reshape(-1, 2), places.right[joins] > _WRONG
+    cuts = ChainCuts.of(len(names), ends[is_believed], told.run[joins[is_believed]])
     found: list[Join] = []
     is_left = np.ones(len(could), dtype=bool)
     while is_left.any() and len(found) < _MAX_JOINS:
         stop_if_abandoned()
         rest()
-        seed = int(np.argmax(np.where(is_left, (alike & is_left).sum(axis=1), -1)))
+        seed = with_most_runs(alike & is_left, told.run[could])
         members = alike[seed] & is_left
         is_left &= ~members
-        believed = could[members]
-        for moving in pair[seed]:
-            doubted = np.setdiff1d(joins[(chain[joins] == moving).any(axis=1)], believed)
+        believed, before = could[members], len(found)
+        first, second = np.searchsorted(names, pair[seed])
+        across = [beyond[ends[:, 0]] != beyond[ends[:, 1]] for beyond in cuts.beyond(first, second)]
+        for is_doubted in (*across, *((ends == end).any(axis=1) for end in (first, second))):
+            doubted = np.setdiff1d(joins[is_doubted], believed)
             contradicted = doubted[places.right[doubted] > _WRONG]
-            # The closures of a run repeat each other whether right or wrong, so a run counts once.
-            if len(np.unique(told.run[believed])) >= len(np.unique(told.run[contradicted])):
+            is_enough = len(np.unique(told.run[believed])) >= len(np.unique(told.run[contradicted]))
+            if is_enough and not any(np.array_equal(doubted, other.doubted) for other in found[before:]):
                 found.append(Join(believed, doubted))
     return found

@@ -12,6 +12,7 @@ from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses, likeliest_l
 from rotavg_ros.solver.slam.poses.em.start import USUAL, PoseStart
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.row_errors import initial_noise
+from rotavg_ros.solver.slam.poses.search.beginnings import begun_at_runs
 from rotavg_ros.solver.slam.poses.search.joins import joined_otherwise
 from rotavg_ros.solver.slam.poses.search.jumps import jumps_too_far, likeliest_jump, with_jump, without_odd_jumps
 from rotavg_ros.solver.slam.poses.search.runs import with_runs, without_runs
@@ -67,6 +68,7 @@ def rival_poses(
     if (other := _begun_otherwise(likeliest)) is not None:
         ended.append(settling(other, least))
     ended.extend(_with_other_runs(_distinct(ended, HOPELESS)[:_MAX_ASKED]))
+    ended.append(begun_at_runs(min(ended, key=lambda rival: rival.cost)))
     ended.extend(_jumping(min(ended, key=lambda rival: rival.cost)))
     rivals = _distinct(ended, _FAR)
     cost = np.array([rival.cost for rival in rivals])

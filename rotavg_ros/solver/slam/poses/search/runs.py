@@ -112,8 +112,11 @@ def unlikely_offsets(pose: PoseMode) -> np.ndarray:
     return np.asarray((off * np.linalg.solve(covariance + np.eye(off.shape[1]), off)).sum(axis=(1, 2)))
 
 
-def _nearest(pose: PoseMode, could: np.ndarray) -> list[np.ndarray]:
-    """Closures of each rejected run, the run whose mean discrepancy is the fewest standard deviations first."""
+def run_discrepancies(pose: PoseMode, could: np.ndarray) -> np.ndarray:
+    """``(R,)`` squares of each run's mean discrepancy, in standard deviations of its predictions by all else.
+
+    Of those of its closures that ``could (C,)`` marks; infinite for less than two.
+    """
     told, predictions, k = pose.problem.told, pose.solved.predictions, pose.problem.turns
     count = np.bincount(told.run, could)
     off = np.stack([np.bincount(told.run, could * told.sign * column) for column in predictions.mean.T], axis=1)
@@ -125,9 +128,14 @@ def _nearest(pose: PoseMode, could: np.ndarray) -> list[np.ndarray]:
     # The members' predictions are nearly the same, so their errors count as fully correlated.
     variance *= np.maximum(count, 1.0)[:, None]
     square = (off**2 / np.maximum(variance, np.finfo(np.float64).tiny)).sum(axis=1)
-    order = np.argsort(np.where(count >= _LEAST_MEMBERS, square, np.inf), kind="stable")[:_LOOKED_AT]
-    members = [np.flatnonzero(could & (told.run == run)) for run in order if count[run] >= _LEAST_MEMBERS]
-    return [each[:_MOST_MEMBERS] for each in members]
+    return np.asarray(np.where(count >= _LEAST_MEMBERS, square, np.inf))
+
+
+def _nearest(pose: PoseMode, could: np.ndarray) -> list[np.ndarray]:
+    """Closures of each rejected run, the run whose mean discrepancy is the fewest standard deviations first."""
+    run, square = pose.problem.told.run, run_discrepancies(pose, could)
+    order = np.argsort(square, kind="stable")[:_LOOKED_AT]
+    return [np.flatnonzero(could & (run == each))[:_MOST_MEMBERS] for each in order if np.isfinite(square[each])]
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.slam.graph.chain_cuts import ChainCuts, with_most_runs
 from rotavg_ros.solver.slam.graph.evenly import evenly
 from rotavg_ros.solver.slam.posterior.em import settle
 from rotavg_ros.solver.slam.posterior.left_out import rough_cost
@@ -55,26 +56,28 @@ def propose_joins(mode: Mode) -> Iterator[Proposal]:
         difference = 2 * np.arccos(np.minimum(np.abs(turned[:, tried[:, 0]].T @ turned), 1.0))
         square = AGREE**2 * problem.components * (variance + variance[tried]) + AGREE_ANGLE**2
         groups = joins & (low == low[tried]) & (high == high[tried]) & (difference**2 < square)
-        best = int((groups & is_left).sum(axis=1).argmax())
+        best = with_most_runs(groups & is_left, problem.run)
         seed, agrees = int(tried[best, 0]), groups[best]
         is_left &= ~agrees
         held = joins & ~mode.is_false & ~((low == low[seed]) & (high == high[seed]) & ~agrees)
-        for chains in _sides(int(number.max()) + 1, ends, ends[:, held], (int(low[seed]), int(high[seed]))):
+        pair = int(low[seed]), int(high[seed])
+        for chains in _sides(int(number.max()) + 1, ends, np.flatnonzero(held), problem.run, pair):
             state = _turned(mode, chains[:, number], turned[:, [seed]])
             predicted = rough_cost(problem, state) - before - OPTIMISM
             yield Proposal("join otherwise", predicted, partial(settle, problem, state, SETTLING), problem.limits.slack)
 
 
-def _sides(count: int, ends: np.ndarray, held: np.ndarray, pair: tuple[int, int]) -> list[np.ndarray]:
+def _sides(count: int, ends: np.ndarray, held: np.ndarray, run: np.ndarray, pair: tuple[int, int]) -> list[np.ndarray]:
     """``(2, n)`` bool each: of n = ``count`` chains, those that turn against others, and these others.
 
     If without the pair's own closures no good ones join its two chains, each turns with all that hangs on it. Otherwise
-    either of the two may be the one that good closures to others misplace, and it turns alone.
+    some of these have to be wrong: those of fewest runs, or all at either of the two, which turns alone.
 
     Args:
         count: number of chains.
         ends: ``(2, C)`` chains that closures join.
-        held: ``(2, H)`` the same of good ones, without those between the pair that the turn makes false.
+        held: ``(H,)`` good ones, without those between the pair that the turn makes false.
+        run: ``(C,)`` the closures' runs.
         pair: lower and higher chain; the higher one turns against the lower one.
     """
 
@@ -82,13 +85,15 @@ def _sides(count: int, ends: np.ndarray, held: np.ndarray, pair: tuple[int, int]
         links = coo_array((np.ones(joined.shape[1]), joined), shape=(count, count))
         return np.asarray(connected_components(links, directed=False)[1])
 
-    component, part = parts(ends), parts(held)
+    component, part = parts(ends), parts(ends[:, held])
     is_near = component == component[pair[0]]
-    lower, higher = (np.arange(count) == each for each in pair)
-    if part[pair[0]] == part[pair[1]]:
-        return [np.stack((higher, is_near & ~higher)), np.stack((is_near & ~lower, lower))]
-    higher = part == part[pair[1]]
-    return [np.stack((higher, is_near & ~higher))]
+    if part[pair[0]] != part[pair[1]]:
+        turning = [part == part[pair[1]]]
+    else:
+        alone = [np.arange(count) == each for each in pair]
+        turning = [*ChainCuts.of(count, ends[:, held].T, run[held]).beyond(*pair), alone[1], ~alone[0]]
+    sides = [np.stack((is_near & beyond, is_near & ~beyond)) for beyond in turning]
+    return [side for number, side in enumerate(sides) if not any(np.array_equal(side, one) for one in sides[:number])]
 
 
 def _turned(mode: Mode, sides: np.ndarray, turn: np.ndarray) -> State:
