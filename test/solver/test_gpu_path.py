@@ -34,7 +34,10 @@ def _forget(traffic: Traffic) -> None:
         record.clear()
 
 
-@pytest.mark.parametrize(("method", "waits"), [("neurora", 320), ("neurora-v2", 73), ("neurora-round", 321)])
+@pytest.mark.parametrize(
+    ("method", "waits"),
+    [("neurora", 320), ("neurora-v2", 73), pytest.param("neurora-round", 321, marks=pytest.mark.large)],
+)
 def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> None:
     graph = _graph()
     with pretended_gpu() as traffic:

@@ -94,6 +94,7 @@ def test_information_that_is_noise_changes_little(seed: int) -> None:
         assert _error(_stating(graph, nonsense), truth) == pytest.approx(plain, rel=0.03)
 
 
+@pytest.mark.large
 def test_nonsense_costs_less_than_a_hundredth_in_the_mean() -> None:
     plain, misled = [], []
     for seed in range(1010, 1018):

@@ -68,9 +68,9 @@ def test_edges_that_agree_leave_no_doubt() -> None:
 @pytest.mark.parametrize(
     "turns",
     [
-        [[0, 0, 0], [0.1, 0, 0], [2, 0, 0], [2.1, 0, 0.1]],
+        pytest.param([[0, 0, 0], [0.1, 0, 0], [2, 0, 0], [2.1, 0, 0.1]], marks=pytest.mark.large),
         [[0, 0, 0], [1.5, 0, 0], [1.5, 0.1, 0]],
-        [[0, 0, 0], [0, 0.15, 0], [0.1, 0, 0], [0, 0, 2]],
+        pytest.param([[0, 0, 0], [0, 0.15, 0], [0.1, 0, 0], [0, 0, 2]], marks=pytest.mark.large),
     ],
 )
 def test_probabilities_are_those_of_brute_force(turns: list[list[float]]) -> None:

@@ -183,6 +183,7 @@ def test_networks_alone_find_cameras_that_look_every_way() -> None:
         assert error_deg(graph, truth, "neurora-v2") < 2.5 * error_deg(graph, truth, "chatterjee")
 
 
+@pytest.mark.large
 def test_where_cleannet_has_the_word_triangles_have_a_start() -> None:
     """Upright cameras: CleanNet tells edges of any rotation by their axes, but some rings were folded for all that."""
     graphs = [nearby(seed, 100, 4, 0.4, upright=True)[:2] for seed in range(8)]

@@ -135,7 +135,8 @@ def test_what_is_drawn_together_is_the_whole_graphs_optimum(kind: str, backward:
     assert np.degrees(off.max()) < 0.05 and apart.max() < 0.01
 
 
-@pytest.mark.parametrize("hills", [False, pytest.param(True, marks=pytest.mark.large)])
+@pytest.mark.large
+@pytest.mark.parametrize("hills", [False, True])
 def test_translations_make_orientations_better(hills: bool) -> None:
     gained = []
     for seed in range(4):

@@ -61,7 +61,7 @@ def slipping_walk(seed: int) -> tuple[ViewGraph, torch.Tensor, torch.Tensor]:
     "seed",
     [
         5,  # the segment was no rival by rotations, for a slip moved to the next segments alone
-        12,  # it was one, but begun at the places of another
+        pytest.param(12, marks=pytest.mark.large),  # it was one, but begun at the places of another
     ],
 )
 def test_the_segment_is_found_and_no_good_closure_pays_for_it(seed: int) -> None:

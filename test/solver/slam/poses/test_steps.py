@@ -88,6 +88,7 @@ def test_squares_far_above_their_prior_end_the_steps() -> None:
     assert found(2.0) == pytest.approx(found(4.0), abs=1e-2)
 
 
+@pytest.mark.large
 def test_positions_are_better_by_it() -> None:
     ratio = []
     for seed in (0, 2, 3):

@@ -82,7 +82,7 @@ def other_joins(pose: PoseMode) -> list[Join]:
     while is_left.any() and len(found) < _MAX_JOINS:
         stop_if_abandoned()
         rest()
-        seed = with_most_runs(alike & is_left, told.run[could])
+        seed = with_most_runs(alike & is_left & is_left[:, None], told.run[could])
         members = alike[seed] & is_left
         is_left &= ~members
         believed, before = could[members], len(found)
