@@ -15,8 +15,10 @@ from rotavg_ros.solver.algebra.minimum_cut import FlowNetwork
 
 def with_most_runs(agree: np.ndarray, run: np.ndarray) -> int:
     """The row of ``agree (T, C)`` whose closures, in runs ``(C,)``, are of most runs; of several, of most closures."""
-    of_run = (run[:, None] == np.unique(run)).astype(np.float64)
-    runs = np.count_nonzero(agree.astype(np.float64) @ of_run, axis=1)
+    # A table of closures by runs would take gigabytes where there are many of both.
+    order = np.argsort(run, kind="stable")
+    first = np.unique(run[order], return_index=True)[1]
+    runs = np.logical_or.reduceat(agree[:, order], first, axis=1).sum(axis=1)
     return int(np.lexsort((-agree.sum(axis=1), -runs))[0])
 
 

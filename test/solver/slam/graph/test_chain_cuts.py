@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from itertools import product
 
 import numpy as np
@@ -38,3 +39,23 @@ def test_runs_count_before_closures() -> None:
     assert with_most_runs(agree, run) == 2
     assert with_most_runs(agree[:2], run) == 1
     assert with_most_runs(agree[::-1] & False, run) == 0
+
+
+@given(st.integers(1, 8), st.integers(1, 12), st.integers(0, 2**32 - 1))
+def test_the_group_of_most_runs_is_that_of_sets(groups: int, closures: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    agree, run = rng.random((groups, closures)) < 0.5, rng.integers(0, 5, closures)
+    counted = [(len(set(run[row].tolist())), int(row.sum())) for row in agree]
+    assert counted[with_most_runs(agree, run)] == max(counted)
+
+
+def test_many_closures_of_as_many_runs_take_little_memory() -> None:
+    count = 20_000
+    agree = np.eye(64, count, dtype=bool)
+    agree[7] = True
+    tracemalloc.start()
+    try:
+        assert with_most_runs(agree, np.arange(count)[::-1]) == 7
+        assert tracemalloc.get_traced_memory()[1] < 5 * agree.nbytes
+    finally:
+        tracemalloc.stop()

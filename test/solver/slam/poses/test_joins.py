@@ -15,6 +15,7 @@ from rotavg_ros import ViewGraph, solve
 from rotavg_ros.metrics.positions import position_errors
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
+from rotavg_ros.solver.slam.poses.search.beginnings import runs_to_begin_at
 from rotavg_ros.solver.slam.poses.search.joins import joined_otherwise, other_joins
 from rotavg_ros.solver.slam.poses.search.settling import Rival
 from rotavg_ros.view_graph import EdgeKind
@@ -127,6 +128,17 @@ def test_a_fleet_is_placed_though_each_pair_has_more_false_joins_than_good_ones(
     assert ((solution.outlier_score.numpy() > 0.5) == streets.is_false).all()
     assert solution.position is not None
     assert position_errors(solution.position.numpy(), streets.position).mean() < 0.5
+
+
+def test_poses_are_not_begun_at_joins() -> None:
+    """Odometry predicts them with any variance, so by its measure each would be predicted best."""
+    streets = in_a_town(0)
+    pose = pose_mode(streets.graph)
+    edge = pose.problem.closures
+    start = PoseStart.joining(pose, np.flatnonzero(~streets.is_false[edge]), np.flatnonzero(streets.is_false[edge]))
+    right = estimate_poses(pose.problem, hold=True, start=replace(start, solves=12))
+    assert (right.solved.places.right[streets.is_false[edge]] < 0.5).all()
+    assert not any(streets.joins[edge[run]].any() for run in runs_to_begin_at(right))
 
 
 def test_one_chain_has_no_joins() -> None:
