@@ -19,7 +19,9 @@ from rotavg_ros.solver.slam.poses.repeats.exactness import mean
 # The variance of a difference is known only roughly, so there are several: each this many times the one before.
 _BROADER = 16.0
 # Number of variances for closures anywhere, and for those that follow each other.
-WIDTHS, WIDTHS_AFTER = 2, 3
+WIDTHS, WIDTHS_AFTER = 2, 5
+# Narrowest of the latter, relative to noise as of good closures: these may err by far more, as along corridors.
+_NARROWEST_AFTER = 1 / 256
 # Turns are alike up to this many standard deviations.
 _FARTHEST = 4.0
 # Probabilities of being the same turn that are smaller than this are neglected.
@@ -85,7 +87,8 @@ def repeated_density(
                 of_turn, of_shift = _difference(turned, axes, row, other, difference)
                 if of_turn < 0:
                     continue
-                _densities(turned, row, difference, (of_turn, of_shift, k), root, same)
+                _, squares, volume = _whitened(turned, row, difference, (of_turn, of_shift, k), root)
+                _fill(same, squares, volume, size - k)
                 repeated = mean(same)
                 likely = repeated / max(repeated + math.exp(log_alone[row]), _LEAST)
                 if likely > _NEGLIGIBLE:
@@ -124,7 +127,8 @@ def repeated_density(
                         difference[d] += weight * apart[at, d]
             for d in range(size):
                 difference[d] /= total
-            square = _densities(turned, c, difference, (of_turn / total**2, 1 / total, k), root, same)
+            square, squares, volume = _whitened(turned, c, difference, (of_turn / total**2, 1 / total, k), root)
+            _fill(same, squares, volume, size - k)
             weight = chance[tells[t]] * math.exp(-square / 2)
             surely[c] += weight
             for width in range(WIDTHS):
@@ -155,7 +159,9 @@ def repeated_after(turned: np.ndarray, axes: Axes, later: np.ndarray, earlier: n
             row, other = (later[pair], earlier[pair]) if end == 0 else (earlier[pair], later[pair])
             of_turn, of_shift = _difference(turned, axes, row, other, difference)
             if of_turn >= 0:
-                _densities(turned, row, difference, (of_turn, of_shift, k), root, density[end, pair])
+                _, squares, volume = _whitened(turned, row, difference, (of_turn, of_shift, k), root)
+                narrowest = volume * _NARROWEST_AFTER ** ((size - k) / 2)
+                _fill(density[end, pair], squares / _NARROWEST_AFTER, narrowest, size - k)
     return density
 
 
@@ -224,27 +230,22 @@ def _difference(turned: np.ndarray, axes: Axes, row: int, other: int, difference
 
 
 @compiled
-def _densities(
-    turned: np.ndarray,
-    row: int,
-    difference: np.ndarray,
-    said: tuple[float, float, int],
-    root: np.ndarray,
-    same: np.ndarray,
-) -> float:
-    """The squared difference of turns, in standard deviations; and densities of the difference of shifts, given it.
+def _whitened(
+    turned: np.ndarray, row: int, difference: np.ndarray, said: tuple[float, float, int], root: np.ndarray
+) -> tuple[float, float, float]:
+    """The squared differences of turns, and of shifts given turns, in standard deviations; and the latter's volume.
+
+    That is the inverse of the height of the normal density of shifts.
 
     Args:
         turned, row: one of the closures.
         difference: ``(k + m,)`` from the other's prediction.
         said: variances of that prediction, rad² and m² per component; k.
         root: ``(k + m + 1, k + m)`` room for Cholesky's factor, and for the whitened difference.
-        same: ``(W,)`` densities, to be filled, the narrowest first.
     """
     of_turn, of_shift, k = said
     size = len(difference)
-    m = size - k
-    square, squares, volume = 0.0, 0.0, (2 * math.pi) ** (m / 2)
+    square, squares, volume = 0.0, 0.0, (2 * math.pi) ** ((size - k) / 2)
     for i in range(size):
         value = difference[i]
         for j in range(i):
@@ -263,8 +264,20 @@ def _densities(
         else:
             squares += root[size, i] * root[size, i]
             volume *= root[i, i]
+    return square, squares, volume
+
+
+@compiled
+def _fill(same: np.ndarray, squares: float, volume: float, components: int) -> None:
+    """Fill ``(W,)`` densities of a difference of shifts, the narrowest first.
+
+    Args:
+        same: to be filled.
+        squares: squared difference, in standard deviations of the narrowest.
+        volume: inverse of that one's height.
+        components: m.
+    """
     for width in range(len(same)):
         same[width] = math.exp(-squares / 2) / volume
         squares /= _BROADER
-        volume *= _BROADER ** (m / 2)
-    return square
+        volume *= _BROADER ** (components / 2)
