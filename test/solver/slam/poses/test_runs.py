@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.stats import chi2, false_discovery_control
 
 from rotavg_ros.solver.slam.poses.closures import NOTHING
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
@@ -15,6 +16,7 @@ from rotavg_ros.solver.slam.poses.rows import jacobian, root_weight, whitening
 from rotavg_ros.solver.slam.poses.search.runs import (
     runs_to_believe,
     runs_to_doubt,
+    too_large,
     unlikely_offsets,
     without_runs,
 )
@@ -35,6 +37,17 @@ def held_wrong(pose: PoseMode) -> tuple[PoseMode, np.ndarray]:
     turn[members] *= NOTHING
     start = replace(start, places=replace(start.places, rotation_weight=turn))
     return estimate_poses(pose.problem, start=start), members
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 40, 400])
+def test_errors_are_improbable_among_as_many_as_there_are(count: int) -> None:
+    """As SciPy controls false discoveries; some of right runs, some of three times their deviation."""
+    rng = np.random.default_rng(count)
+    square = rng.chisquare(3, count) * np.where(np.arange(count) % 7 == 2, 9.0, 1.0)
+    expected = np.flatnonzero(false_discovery_control(chi2.sf(square, 3)) <= 0.05) if count else np.zeros(0)
+    found = too_large(square, 3)
+    np.testing.assert_array_equal(np.sort(found), expected)
+    assert (np.diff(square[found]) <= 0).all()
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.large) for seed in (2, 5))])

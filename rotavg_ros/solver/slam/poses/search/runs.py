@@ -32,7 +32,7 @@ from rotavg_ros.solver.slam.poses.solved import PoseMode
 # estimate that begins with these believed.
 _LOOKED_AT, _LEAST_MEMBERS, _MOST_MEMBERS = 32, 2, 96
 _WRONG = 0.5
-# A run is doubted if a common error this large has less than this probability.
+# Expected share of right runs among those doubted, at most.
 _UNLIKELY = 0.05
 # Maximum number of rounds of believing, or of doubting; and number of runs that each round of doubting tries.
 _MAX_RUNS, _MAX_DOUBTED = 8, 4
@@ -93,10 +93,21 @@ def runs_to_doubt(pose: PoseMode) -> list[np.ndarray]:
     believed = np.flatnonzero((pose.solved.places.right > _WRONG) & (of_run >= 0) & could_be_wrong)
     most = np.zeros(run.max(initial=-1) + 1)
     np.maximum.at(most, run[believed], unlikely_offsets(pose)[of_run[believed]])
-    by_chance = chdtrc(problem.turns + problem.shifts, most)
-    order = np.argsort(-most, kind="stable")
-    members = [believed[run[believed] == each] for each in order[by_chance[order] < _UNLIKELY]]
-    return [each for each in members if len(each) >= _LEAST_MEMBERS]
+    large = np.flatnonzero(np.bincount(run[believed], minlength=len(most)) >= _LEAST_MEMBERS)
+    improbable = large[too_large(most[large], problem.turns + problem.shifts)]
+    return [believed[run[believed] == each] for each in improbable]
+
+
+def too_large(square: np.ndarray, components: int) -> np.ndarray:
+    """Which of ``(n,)`` squares in as many components are improbable among so many, the largest first.
+
+    By step-up bounds (Benjamini & Hochberg 1995): of a hundred right runs five have an error that would be improbable
+    by itself, and an estimate without each takes about as long as the first one.
+    """
+    order = np.argsort(-square, kind="stable")
+    bound = _UNLIKELY * np.arange(1, len(order) + 1) / max(len(order), 1)
+    last = np.flatnonzero(chdtrc(components, square[order]) <= bound).max(initial=-1)
+    return np.asarray(order[: last + 1])
 
 
 def unlikely_offsets(pose: PoseMode) -> np.ndarray:
