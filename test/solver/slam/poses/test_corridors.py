@@ -1,4 +1,4 @@
-"""Corridors at right angles: closures err along them, while places that look alike are mistaken exactly."""
+"""Corridors at right angles: closures err along them, and repeat a false turn of the map exactly between the walls."""
 
 from __future__ import annotations
 
@@ -130,10 +130,11 @@ def walk(seed: int) -> Walk:
 
 
 @pytest.mark.parametrize("seed", [66, 70, 118])
-def test_runs_that_agree_exactly_are_no_slip(seed: int) -> None:
+def test_runs_that_agree_between_the_walls_are_no_slip(seed: int) -> None:
     """A part that only false closures lead to, by turns near a right angle: with a slip, a run would be right.
 
-    That the run repeats one turn of the map by centimetres, where good closures err by more than a metre, tells.
+    That the run repeats one turn of the map to centimetres between the walls, as exactly as good closures tell, is what
+    speaks for it.
     """
     run = walk(seed)
     solution = solve(run.graph)

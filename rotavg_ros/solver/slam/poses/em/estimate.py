@@ -40,7 +40,7 @@ from rotavg_ros.solver.slam.poses.row_errors import (
     even_shifts,
     own_variance,
     shift_covariance,
-    stated_variance,
+    stated_covariance,
     turn_variances,
 )
 from rotavg_ros.solver.slam.poses.rows import jacobian, residuals, root_weight, whitening
@@ -148,7 +148,7 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     scale = _expected_scale(problem, state, predictions, way)
     judge = replace(judge, told=replace(judge.told, rotation_variance=turned[closure, 0]))
     spend(_ROW * len(rows))
-    maps = MapTurns.of(problem, state.position, predictions, stated_variance(problem, state))
+    maps = MapTurns.of(problem, state.position, predictions, stated_covariance(problem, state))
     spend(_ROW * len(rows))
     judged = judge(predictions, maps, places.chance, scale)
     return Solved(

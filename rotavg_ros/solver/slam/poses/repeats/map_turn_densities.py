@@ -19,9 +19,7 @@ from rotavg_ros.solver.slam.poses.repeats.exactness import mean
 # The variance of a difference is known only roughly, so there are several: each this many times the one before.
 _BROADER = 16.0
 # Number of variances for closures anywhere, and for those that follow each other.
-WIDTHS, WIDTHS_AFTER = 2, 5
-# Narrowest of the latter, relative to noise as of good closures: these may err by far more, as along corridors.
-_NARROWEST_AFTER = 1 / 256
+WIDTHS, WIDTHS_AFTER = 2, 3
 # Turns are alike up to this many standard deviations.
 _FARTHEST = 4.0
 # Probabilities of being the same turn that are smaller than this are neglected.
@@ -78,16 +76,17 @@ def repeated_density(
     number = np.empty(len(tells), np.int64)
     alike, how = np.empty((len(tells), most), np.int64), np.empty((len(tells), most))
     difference, root, same = np.empty(size), np.empty((size + 1, size)), np.empty(WIDTHS)
+    spread, even = np.empty((size - k, size - k)), np.eye(size - k)
     for t in range(len(tells)):
         row = tells[t]
         alike[t, 0], how[t, 0], number[t] = row, chance[row], 1
         for side in range(2):
             for place in range(near[t, 2 * side], near[t, 2 * side + 1]):
                 other = tells[place]
-                of_turn, of_shift = _difference(turned, axes, row, other, difference)
+                of_turn, of_shift = _difference(turned, axes, row, other, (difference, spread))
                 if of_turn < 0:
                     continue
-                _, squares, volume = _whitened(turned, row, difference, (of_turn, of_shift, k), root)
+                _, squares, volume = _whitened(turned, row, difference, (of_turn, of_shift * even), root)
                 _fill(same, squares, volume, size - k)
                 repeated = mean(same)
                 likely = repeated / max(repeated + math.exp(log_alone[row]), _LEAST)
@@ -104,7 +103,7 @@ def repeated_density(
         c, found = of_all.rows[asked], 0
         for side in range(2):
             for place in range(nearby[asked, 2 * side], nearby[asked, 2 * side + 1]):
-                of_turn, of_shift = _difference(turned, axes, c, tells[place], difference)
+                of_turn, of_shift = _difference(turned, axes, c, tells[place], (difference, spread))
                 if of_turn >= 0:
                     listed[found], slot[tells[place]] = place, found
                     for d in range(size):
@@ -127,7 +126,7 @@ def repeated_density(
                         difference[d] += weight * apart[at, d]
             for d in range(size):
                 difference[d] /= total
-            square, squares, volume = _whitened(turned, c, difference, (of_turn / total**2, 1 / total, k), root)
+            square, squares, volume = _whitened(turned, c, difference, (of_turn / total**2, even / total), root)
             _fill(same, squares, volume, size - k)
             weight = chance[tells[t]] * math.exp(-square / 2)
             surely[c] += weight
@@ -153,32 +152,35 @@ def repeated_after(turned: np.ndarray, axes: Axes, later: np.ndarray, earlier: n
     k = axes.turns.shape[1]
     size = k + axes.shifts.shape[1]
     density = np.zeros((2, len(later), WIDTHS_AFTER))
-    difference, root = np.empty(size), np.empty((size + 1, size))
+    difference, root, spread = np.empty(size), np.empty((size + 1, size)), np.empty((size - k, size - k))
     for pair in range(len(later)):
         for end in range(2):
             row, other = (later[pair], earlier[pair]) if end == 0 else (earlier[pair], later[pair])
-            of_turn, of_shift = _difference(turned, axes, row, other, difference)
+            of_turn, _ = _difference(turned, axes, row, other, (difference, spread))
             if of_turn >= 0:
-                _, squares, volume = _whitened(turned, row, difference, (of_turn, of_shift, k), root)
-                narrowest = volume * _NARROWEST_AFTER ** ((size - k) / 2)
-                _fill(density[end, pair], squares / _NARROWEST_AFTER, narrowest, size - k)
+                _, squares, volume = _whitened(turned, row, difference, (of_turn, spread), root)
+                _fill(density[end, pair], squares, volume, size - k)
     return density
 
 
 @compiled
-def _difference(turned: np.ndarray, axes: Axes, row: int, other: int, difference: np.ndarray) -> tuple[float, float]:
+def _difference(
+    turned: np.ndarray, axes: Axes, row: int, other: int, predicted: tuple[np.ndarray, np.ndarray]
+) -> tuple[float, float]:
     """Compute the difference between one closure and what the turn of another predicts for it.
 
     Args:
         turned: closures.
         axes: of turns and shifts.
         row, other: the two closures.
-        difference: ``(k + m,)`` rad and metres, to be filled.
+        predicted: to be filled: the difference ``(k + m,)``, rad and metres; lower half ``(m, m)`` of the covariance of
+            the predicted shift, m².
 
     Returns:
         Variances per component of the prediction, rad² and m²; negative if their turns are not the same.
     """
     turns, shifts = axes
+    difference, spread = predicted
     k, m = turns.shape[1], shifts.shape[1]
     size = k + m
     own, of_turn = 0.0, 0.0
@@ -213,25 +215,31 @@ def _difference(turned: np.ndarray, axes: Axes, row: int, other: int, difference
     off0 = turned[row, _SHIFT] - turned[other, _SHIFT] - t0 + arm0
     off1 = turned[row, _SHIFT + 1] - turned[other, _SHIFT + 1] - t1 + arm1
     off2 = turned[row, _SHIFT + 2] - turned[other, _SHIFT + 2] - t2 + arm2
-    of_shift = 0.0
+    # How far each turn of the other's moves it along each axis: sᵀ (t ×) = (s × t)ᵀ.
+    lever = np.empty((m, k))
     for e in range(m):
         s0, s1, s2 = shifts[0, e], shifts[1, e], shifts[2, e]
         difference[k + e] = off0 * s0 + off1 * s1 + off2 * s2
-        # sᵀ (t ×) = (s × t)ᵀ: how far the other's turn moves it along this axis.
         l0, l1, l2 = s1 * t2 - s2 * t1, s2 * t0 - s0 * t2, s0 * t1 - s1 * t0
-        of_shift += turned[other, _COVARIANCE + (k + e) * size + k + e]
         for d in range(k):
-            lever = l0 * turns[0, d] + l1 * turns[1, d] + l2 * turns[2, d]
-            of_shift -= 2 * lever * turned[other, _COVARIANCE + d * size + k + e]
-            for f in range(k):
-                another = l0 * turns[0, f] + l1 * turns[1, f] + l2 * turns[2, f]
-                of_shift += lever * another * turned[other, _COVARIANCE + d * size + f]
+            lever[e, d] = l0 * turns[0, d] + l1 * turns[1, d] + l2 * turns[2, d]
+    of_shift = 0.0
+    for e in range(m):
+        for g in range(e + 1):
+            entry = turned[other, _COVARIANCE + (k + e) * size + k + g]
+            for d in range(k):
+                entry -= lever[e, d] * turned[other, _COVARIANCE + d * size + k + g]
+                entry -= lever[g, d] * turned[other, _COVARIANCE + d * size + k + e]
+                for f in range(k):
+                    entry += lever[e, d] * lever[g, f] * turned[other, _COVARIANCE + d * size + f]
+            spread[e, g] = entry
+        of_shift += spread[e, e]
     return of_turn / k, of_shift / m
 
 
 @compiled
 def _whitened(
-    turned: np.ndarray, row: int, difference: np.ndarray, said: tuple[float, float, int], root: np.ndarray
+    turned: np.ndarray, row: int, difference: np.ndarray, said: tuple[float, np.ndarray], root: np.ndarray
 ) -> tuple[float, float, float]:
     """The squared differences of turns, and of shifts given turns, in standard deviations; and the latter's volume.
 
@@ -240,21 +248,25 @@ def _whitened(
     Args:
         turned, row: one of the closures.
         difference: ``(k + m,)`` from the other's prediction.
-        said: variances of that prediction, rad² and m² per component; k.
+        said: variance of that prediction's turn, rad² per component, and lower half ``(m, m)`` of its shift's
+            covariance, m².
         root: ``(k + m + 1, k + m)`` room for Cholesky's factor, and for the whitened difference.
     """
-    of_turn, of_shift, k = said
+    of_turn, spread = said
     size = len(difference)
-    square, squares, volume = 0.0, 0.0, (2 * math.pi) ** ((size - k) / 2)
+    k = size - len(spread)
+    square, squares, volume = 0.0, 0.0, (2 * math.pi) ** (len(spread) / 2)
     for i in range(size):
         value = difference[i]
         for j in range(i):
             entry = turned[row, _COVARIANCE + i * size + j]
+            if j >= k:
+                entry += spread[i - k, j - k]
             for n in range(j):
                 entry -= root[i, n] * root[j, n]
             root[i, j] = entry / root[j, j]
             value -= root[i, j] * root[size, j]
-        pivot = turned[row, _COVARIANCE + i * size + i] + (of_turn if i < k else of_shift)
+        pivot = turned[row, _COVARIANCE + i * size + i] + (of_turn if i < k else spread[i - k, i - k])
         for n in range(i):
             pivot -= root[i, n] * root[i, n]
         root[i, i] = math.sqrt(pivot)

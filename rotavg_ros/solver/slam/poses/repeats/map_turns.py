@@ -41,7 +41,7 @@ class MapTurns:
 
     @classmethod
     def of(
-        cls, problem: PoseProblem, position: np.ndarray, predictions: Predictions, closure_variance: np.ndarray
+        cls, problem: PoseProblem, position: np.ndarray, predictions: Predictions, closure_covariance: np.ndarray
     ) -> MapTurns:
         """From the deviations of closures from the predictions by all else.
 
@@ -49,7 +49,7 @@ class MapTurns:
             problem: the graph.
             position: ``(K, 3)`` metres, of the key nodes.
             predictions: of closures by all else.
-            closure_variance: ``(C,)`` m² per component, of good closures.
+            closure_covariance: ``(C, m, m)`` m², of good closures' shifts.
         """
         closure, (turns, shifts), drawn = problem.mode.problem.closure, problem.bases, problem.drawn
         k, m = turns.shape[1], shifts.shape[1]
@@ -65,8 +65,9 @@ class MapTurns:
         turn[:, is_back], shift[is_back] = inverse, -shift[is_back]
         change[is_back, :k, :k] = turns.T @ quaternion_rows.matrices(inverse) @ turns @ problem.told.uneven[is_back]
         change[is_back, k:, k:] *= -1
-        own = np.repeat(np.stack((problem.told.rotation_variance, closure_variance), axis=1), (k, m), axis=1)
-        noise = own[:, :, None] * np.eye(k + m)
+        noise = np.zeros_like(change)
+        noise[:, :k, :k] = problem.told.rotation_variance[:, None, None] * np.eye(k)
+        noise[:, k:, k:] = closure_covariance
         back_turned = change.transpose(0, 2, 1)
         return cls(
             turn,
