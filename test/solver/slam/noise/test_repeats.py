@@ -19,9 +19,10 @@ def test_densities_are_means_over_a_run_those_before_and_all(
 ) -> None:
     rng = np.random.default_rng(seed)
     # Few places, so that many are near each other, or the other way round.
-    older, newer = rng.integers(0, 4, count) * 20.0, 500 + rng.integers(0, 4, count) * 20.0
+    ends = np.stack((rng.integers(0, 4, count) * 20.0, 500 + rng.integers(0, 4, count) * 20.0), axis=1)
     swapped = rng.random(count) < 0.3
-    older, newer = np.where(swapped, newer, older), np.where(swapped, older, newer)
+    ends[swapped] = ends[swapped, ::-1]
+    older, newer = ends.T  # in memory as a problem has them: other layouts would be compiled anew
     turn = Rotation.from_rotvec(0.1 * rng.normal(size=(count, 3)) * ([0, 0, 1] if components == 1 else 1))
     is_told, false = rng.random(count) < 0.9, np.flatnonzero(rng.random(count) < 0.7)
     rows = np.arange(count)

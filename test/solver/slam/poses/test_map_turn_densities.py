@@ -64,7 +64,9 @@ class Turned:
 
     @classmethod
     def draw(cls, rng: Generator, *, planar: bool) -> Turned:
-        axes = Axes(*(np.eye(3)[:, 2:], np.eye(3)[:, :2]) if planar else (np.eye(3), np.eye(3)))
+        turns, shifts = (np.eye(3)[:, 2:], np.eye(3)[:, :2]) if planar else (np.eye(3), np.eye(3))
+        # Contiguous as a map's are: other layouts would be compiled anew.
+        axes = Axes(np.ascontiguousarray(turns), np.ascontiguousarray(shifts))
         k, m = axes.turns.shape[1], axes.shifts.shape[1]
         angle = rng.choice([0.5, 1.2], COUNT)[:, None] + 0.1 * rng.normal(size=(COUNT, k))
         turn = Rotation.from_rotvec(angle @ axes.turns.T)
