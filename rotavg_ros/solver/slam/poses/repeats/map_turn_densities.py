@@ -76,17 +76,18 @@ def repeated_density(
     number = np.empty(len(tells), np.int64)
     alike, how = np.empty((len(tells), most), np.int64), np.empty((len(tells), most))
     difference, root, same = np.empty(size), np.empty((size + 1, size)), np.empty(WIDTHS)
-    spread, even = np.empty((size - k, size - k)), np.eye(size - k)
+    spread, lever = np.empty((size - k, size - k)), np.empty((size - k, k))
     for t in range(len(tells)):
         row = tells[t]
         alike[t, 0], how[t, 0], number[t] = row, chance[row], 1
         for side in range(2):
             for place in range(near[t, 2 * side], near[t, 2 * side + 1]):
                 other = tells[place]
-                of_turn, of_shift = _difference(turned, axes, row, other, (difference, spread))
+                of_turn, of_shift = _difference(turned, axes, row, other, (difference, spread, lever))
                 if of_turn < 0:
                     continue
-                _, squares, volume = _whitened(turned, row, difference, (of_turn, of_shift * even), root)
+                _fill_evenly(spread, of_shift)
+                _, squares, volume = _whitened(turned, row, difference, (of_turn, spread), root)
                 _fill(same, squares, volume, size - k)
                 repeated = mean(same)
                 likely = repeated / max(repeated + math.exp(log_alone[row]), _LEAST)
@@ -103,7 +104,7 @@ def repeated_density(
         c, found = of_all.rows[asked], 0
         for side in range(2):
             for place in range(nearby[asked, 2 * side], nearby[asked, 2 * side + 1]):
-                of_turn, of_shift = _difference(turned, axes, c, tells[place], (difference, spread))
+                of_turn, of_shift = _difference(turned, axes, c, tells[place], (difference, spread, lever))
                 if of_turn >= 0:
                     listed[found], slot[tells[place]] = place, found
                     for d in range(size):
@@ -126,7 +127,8 @@ def repeated_density(
                         difference[d] += weight * apart[at, d]
             for d in range(size):
                 difference[d] /= total
-            square, squares, volume = _whitened(turned, c, difference, (of_turn / total**2, even / total), root)
+            _fill_evenly(spread, 1 / total)
+            square, squares, volume = _whitened(turned, c, difference, (of_turn / total**2, spread), root)
             _fill(same, squares, volume, size - k)
             weight = chance[tells[t]] * math.exp(-square / 2)
             surely[c] += weight
@@ -152,11 +154,12 @@ def repeated_after(turned: np.ndarray, axes: Axes, later: np.ndarray, earlier: n
     k = axes.turns.shape[1]
     size = k + axes.shifts.shape[1]
     density = np.zeros((2, len(later), WIDTHS_AFTER))
-    difference, root, spread = np.empty(size), np.empty((size + 1, size)), np.empty((size - k, size - k))
+    difference, root = np.empty(size), np.empty((size + 1, size))
+    spread, lever = np.empty((size - k, size - k)), np.empty((size - k, k))
     for pair in range(len(later)):
         for end in range(2):
             row, other = (later[pair], earlier[pair]) if end == 0 else (earlier[pair], later[pair])
-            of_turn, _ = _difference(turned, axes, row, other, (difference, spread))
+            of_turn, _ = _difference(turned, axes, row, other, (difference, spread, lever))
             if of_turn >= 0:
                 _, squares, volume = _whitened(turned, row, difference, (of_turn, spread), root)
                 _fill(density[end, pair], squares, volume, size - k)
@@ -165,7 +168,7 @@ def repeated_after(turned: np.ndarray, axes: Axes, later: np.ndarray, earlier: n
 
 @compiled
 def _difference(
-    turned: np.ndarray, axes: Axes, row: int, other: int, predicted: tuple[np.ndarray, np.ndarray]
+    turned: np.ndarray, axes: Axes, row: int, other: int, predicted: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> tuple[float, float]:
     """Compute the difference between one closure and what the turn of another predicts for it.
 
@@ -174,13 +177,13 @@ def _difference(
         axes: of turns and shifts.
         row, other: the two closures.
         predicted: to be filled: the difference ``(k + m,)``, rad and metres; lower half ``(m, m)`` of the covariance of
-            the predicted shift, m².
+            the predicted shift, m²; and ``(m, k)`` metres a radian by which turns of the other one move it.
 
     Returns:
         Variances per component of the prediction, rad² and m²; negative if their turns are not the same.
     """
     turns, shifts = axes
-    difference, spread = predicted
+    difference, spread, lever = predicted
     k, m = turns.shape[1], shifts.shape[1]
     size = k + m
     own, of_turn = 0.0, 0.0
@@ -215,8 +218,7 @@ def _difference(
     off0 = turned[row, _SHIFT] - turned[other, _SHIFT] - t0 + arm0
     off1 = turned[row, _SHIFT + 1] - turned[other, _SHIFT + 1] - t1 + arm1
     off2 = turned[row, _SHIFT + 2] - turned[other, _SHIFT + 2] - t2 + arm2
-    # How far each turn of the other's moves it along each axis: sᵀ (t ×) = (s × t)ᵀ.
-    lever = np.empty((m, k))
+    # The lever arms: sᵀ (t ×) = (s × t)ᵀ.
     for e in range(m):
         s0, s1, s2 = shifts[0, e], shifts[1, e], shifts[2, e]
         difference[k + e] = off0 * s0 + off1 * s1 + off2 * s2
@@ -277,6 +279,14 @@ def _whitened(
             squares += root[size, i] * root[size, i]
             volume *= root[i, i]
     return square, squares, volume
+
+
+@compiled
+def _fill_evenly(spread: np.ndarray, variance: float) -> None:
+    """Fill a covariance ``(m, m)``: the same along all axes."""
+    spread[:] = 0.0
+    for e in range(len(spread)):
+        spread[e, e] = variance
 
 
 @compiled
