@@ -98,25 +98,19 @@ def own_variance(problem: PoseProblem, noise: PoseNoise, square_length: np.ndarr
 
 def even_shifts(problem: PoseProblem, state: PoseState, share: np.ndarray) -> EvenShifts:
     """Units in which closures' shifts err alike along all axes; a share ``(C,)`` of their variances has a shape."""
-    axes = problem.bases[1]
-    return EvenShifts.of(axes.T @ state.shape @ axes, _closure_frame(problem, state), share)
-
-
-def stated_covariance(problem: PoseProblem, state: PoseState) -> np.ndarray:
-    """``(C, m, m)`` m², of the shifts of good closures that are as long as they state."""
-    axes, frame = problem.bases[1], _closure_frame(problem, state)
-    alike = state.noise.of_closures(problem.stated_square) - state.noise.closure
-    shaped = frame @ (axes.T @ state.shape @ axes) @ frame.transpose(0, 2, 1)
-    return np.asarray(alike[:, None, None] * np.eye(problem.shifts) + state.noise.closure * shaped)
-
-
-def _closure_frame(problem: PoseProblem, state: PoseState) -> np.ndarray:
-    """``(C, m, m)`` from the axes of the body that saw each closure from its older end to those of shifts."""
     drawn, closure = problem.drawn, problem.mode.problem.closure
     older = drawn.nodes[np.where(drawn.is_forward[closure], drawn.source[closure], drawn.target[closure])]
     body_from_world = np.ascontiguousarray(problem.orientations(state)[older].T)
     axes = problem.bases[1]
-    return np.asarray(axes.T @ quaternion_rows.matrices(quaternion_rows.inverse(body_from_world)) @ axes)
+    frame = axes.T @ quaternion_rows.matrices(quaternion_rows.inverse(body_from_world)) @ axes
+    return EvenShifts.of(axes.T @ state.shape @ axes, frame, share)
+
+
+def stated_covariance(problem: PoseProblem, noise: PoseNoise, shifts: EvenShifts) -> np.ndarray:
+    """``(C, m, m)`` m², of the shifts of good closures that are as long as they state, given their shape."""
+    alike = noise.of_closures(problem.stated_square) - noise.closure
+    shaped = shifts.frame @ shifts.shape @ shifts.frame.transpose(0, 2, 1)
+    return np.asarray(alike[:, None, None] * np.eye(problem.shifts) + noise.closure * shaped)
 
 
 def mean_closure_shift(problem: PoseProblem, shape: np.ndarray) -> float:

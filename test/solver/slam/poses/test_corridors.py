@@ -14,6 +14,9 @@ from rotavg_ros.metrics.positions import position_errors
 from rotavg_ros.solver import solve
 from rotavg_ros.view_graph import ViewGraph
 
+from .test_even_shifts import of_camera
+from .test_map_turns import reversed_closures
+
 # Crossings along each side, metres between them and between keyframes, and corridors that are walked.
 CROSSINGS, BLOCK_M, STEP_M, WALKED = 3, 25.0, 1.5, 30
 # Standard deviations: degrees about the vertical; metres ahead and sideways.
@@ -143,3 +146,15 @@ def test_runs_that_agree_between_the_walls_are_no_slip(seed: int) -> None:
     assert float(solution.outlier_score[odometry].max()) < 0.5
     assert float(solution.outlier_score[run.is_false].min()) > 0.5
     assert np.sqrt((position_errors(solution.position.numpy(), run.position) ** 2).mean()) < 1.0
+
+
+def test_ends_and_the_bodys_axes_do_not_matter() -> None:
+    """The shape of errors is that in the axes of the body at the older end, whatever these are called."""
+    run = walk(66)
+    graphs = run.graph, of_camera(run.graph), reversed_closures(run.graph, np.random.default_rng(0))
+    first, *others = (solve(graph) for graph in graphs)
+    assert first.position is not None
+    for other in others:
+        np.testing.assert_array_equal(first.outlier_score > 0.5, other.outlier_score > 0.5)
+        assert other.position is not None
+        assert position_errors(other.position.numpy(), first.position.numpy()).max() < 0.05

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros.metrics.positions import position_errors
 from rotavg_ros.solver import solve
 from rotavg_ros.solver.slam.poses.even.shifts import EvenShifts, likeliest_shape
+from rotavg_ros.solver.slam.poses.row_errors import even_shifts, stated_covariance
 from rotavg_ros.view_graph import ViewGraph
 
 from .test_poses import SimulatedRun, errors, graph_of, pose_mode, simulated
@@ -48,6 +49,22 @@ def test_the_axes_are_found(camera: bool) -> None:
     assert np.sqrt(variance[-1] / variance[0]) == pytest.approx(AHEAD, rel=0.25)
     ahead = CAMERA.inv().apply([0.0, 1.0, 0.0]) if camera else np.array([0.0, 1.0, 0.0])
     assert abs(axes[:, -1] @ ahead) > 0.99
+
+
+@torch.no_grad()
+def test_the_stated_covariance_is_the_shape_seen_from_the_older_end() -> None:
+    """Against SciPy's rotations, of closures at headings all round; what has no shape is alike along all axes."""
+    graph, _ = seen_again(0, ahead=AHEAD)
+    pose = pose_mode(graph)
+    problem, state = pose.problem, pose.state
+    covariance = stated_covariance(problem, state.noise, even_shifts(problem, state, np.ones(len(problem.closures))))
+    older = np.minimum(graph.source.numpy(), graph.target.numpy())[problem.closures]
+    world_from_body = Rotation.from_quat(problem.orientations(state)[older]).inv().as_matrix()
+    axes = problem.bases[1]
+    shaped = axes.T @ world_from_body @ state.shape @ world_from_body.transpose(0, 2, 1) @ axes
+    alike = state.noise.common + state.noise.relative * problem.stated_square
+    expected = state.noise.closure * shaped + alike[:, None, None] * np.eye(2)
+    np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-12)
 
 
 def in_a_building(seed: int, ahead: float) -> tuple[SimulatedRun, ViewGraph]:
