@@ -20,6 +20,7 @@ INWARD: dict[str, set[str]] = {
     "view_graph": {"errors", "rotations"},
     "odometry_route": set(),
     "hamilton": set(),
+    "stamps": set(),
     "startup": set(),
     "packed": set(),
     "yaml_keys": set(),
@@ -34,7 +35,7 @@ INWARD: dict[str, set[str]] = {
     "reports": {"errors", "metrics", "online", "replay", "version", "view_graph", "whole_file", "wording"},
     "evaluation": {
         *("baselines", "datasets", "errors", "metrics", "online", "reports", "results"),
-        *("rotations", "solver", "training", "version", "view_graph"),
+        *("rotations", "solver", "stamps", "training", "version", "view_graph"),
     },
     "training": {
         "datasets",
@@ -55,11 +56,12 @@ INWARD: dict[str, set[str]] = {
         "option",
         "rotations",
         "solver",
+        "stamps",
         "startup",
         "view_graph",
         "whole_file",
     },
-    "inputs": {"online", "view_graph"},
+    "inputs": {"online", "stamps", "view_graph"},
     "settings": {"inputs", "online", "option", "view_graph", "yaml_keys"},
 }
 # Inside a wing, the rooms (modules and folders) that a room may import; "" is what the folder's own name gives.
@@ -285,6 +287,7 @@ NODE_MAY_USE = {
     "option",
     "settings",
     "solver",
+    "stamps",
     "startup",
     "version",
     "view_graph",
@@ -444,4 +447,4 @@ def test_parameters_that_travel_together_are_a_class() -> None:
 
 def test_a_seconds_nanoseconds_are_defined_once() -> None:
     defining = re.compile(r"^_?NANOSECONDS\b.*=", re.MULTILINE)
-    assert [name for name, file in MODULES.items() if defining.search(file.read_text("utf-8"))] == ["online.options"]
+    assert [name for name, file in MODULES.items() if defining.search(file.read_text("utf-8"))] == ["stamps"]

@@ -67,6 +67,14 @@ def test_a_node_needs_no_pictures_bags_or_evaluation_and_leaves_the_solver_to_it
     assert not modules & {"rotavg_ros.solver.pipeline", "rotavg_ros.solver.networks", "safetensors", "scipy", "numba"}
 
 
+@pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="needs ROS 2")
+def test_playing_a_bag_needs_no_solver() -> None:
+    modules = modules_of(_TELL + "import rotavg_ros.cli.play, rotavg_ros.ros.harness.player")
+    assert "rosbags" in modules
+    assert not modules & {"torch", "scipy", "numba"}
+    assert wings(modules) == {"bags", "cli", "errors", "packed", "ros", "stamps", "version"}
+
+
 @pytest.mark.parametrize("enabled", [True, False])
 def test_what_is_loaded_is_never_looked_through_and_the_collector_is_as_it_was(enabled: bool) -> None:
     was_enabled = gc.isenabled()

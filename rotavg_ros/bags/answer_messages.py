@@ -15,8 +15,8 @@ from rotavg_ros.bags.message_types import typestore
 from rotavg_ros.online import Answer
 from rotavg_ros.online.answer.drawing import EDGE_WIDTH_M, KEYFRAME_COLOR, KEYFRAME_SIZE_M, PALETTE, Drawing
 from rotavg_ros.online.answer.trajectory import Trajectory
-from rotavg_ros.online.options import NANOSECONDS
 from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.stamps import NANOSECONDS
 
 ORIENTATIONS = "rotavg_msgs/msg/AbsoluteOrientations"
 FLAGS = "rotavg_msgs/msg/OutlierFlags"

@@ -25,7 +25,7 @@ from rotavg_ros.bags.topics import EDGE_TOPIC, GRAPH_NOTE, ODOM_TOPIC, TRUTH_TOP
 from rotavg_ros.bags.writer import BagWriteError, BagWriter
 from rotavg_ros.datasets.dead_reckoning import chain_poses
 from rotavg_ros.datasets.files.graph_file import GraphFile
-from rotavg_ros.online.options import NANOSECONDS
+from rotavg_ros.stamps import NANOSECONDS
 
 # First stamp for a graph without stamps, which get one keyframe every 0.1 s.
 START_STAMP_NS = 1_700_000_000_000_000_000

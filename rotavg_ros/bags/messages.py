@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rotavg_ros.bags.message_types import typestore
-from rotavg_ros.online.options import NANOSECONDS
+from rotavg_ros.stamps import NANOSECONDS
 
 # Unknown covariance: 36 zeros, as most odometry sources send.
 _NO_COVARIANCE = np.zeros(36)

@@ -15,7 +15,7 @@ from rotavg_ros.online.measurements import RejectedInputError, RejectReason
 from rotavg_ros.online.odometry.data_time import DataTime
 from rotavg_ros.online.odometry.time_jumps import RUN_LENGTH
 from rotavg_ros.online.odometry.track import OdometryTrack
-from rotavg_ros.online.options import NANOSECONDS
+from rotavg_ros.stamps import NANOSECONDS
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE
 
 # Stamp in ns, position, world-from-body xyzw.

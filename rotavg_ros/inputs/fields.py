@@ -13,8 +13,8 @@ from typing import Any
 
 from rotavg_ros.online import RejectReason, quaternion
 from rotavg_ros.online.measurements import RejectedInputError, checked_rotation
-from rotavg_ros.online.options import NANOSECONDS
 from rotavg_ros.online.quaternion import Quaternion, Vector
+from rotavg_ros.stamps import NANOSECONDS
 
 # (robot, keyframe id)
 Key = tuple[str, int]

@@ -18,8 +18,9 @@ from rotavg_ros.online.answer.screening import Known
 from rotavg_ros.online.graph.builder import GraphBuilder
 from rotavg_ros.online.graph.growth import Growth
 from rotavg_ros.online.measurements import KeyframeReference, OdometryMessage, RejectReason
-from rotavg_ros.online.options import NANOSECONDS, EstimatorOptions
+from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.stamps import NANOSECONDS
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from rotavg_ros.option import (
     path_of,
 )
 from rotavg_ros.solver import DEVICES, PROFILES, TRANSLATION_SCALES
+from rotavg_ros.stamps import NANOSECONDS
 
-NANOSECONDS = 1_000_000_000
 # Largest number of edges per possible keyframe, its odometry edge included. So closures are bounded by the keyframes,
 # even if a robot closes loops between the same few again and again.
 EDGES_PER_KEYFRAME = 6

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rotavg_ros.online.options import NANOSECONDS
 from rotavg_ros.solver import SECONDS_PER_UNIT
+from rotavg_ros.stamps import NANOSECONDS
 
 
 @dataclass(frozen=True)

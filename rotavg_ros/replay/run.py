@@ -17,7 +17,6 @@ from rotavg_ros.inputs import ODOMETRY_CONVERTERS, OdometryRecord
 from rotavg_ros.online import Answer, OnlineEstimator
 from rotavg_ros.online.content import Counts
 from rotavg_ros.online.measurements import OWN_EDGE_ID
-from rotavg_ros.online.options import NANOSECONDS
 from rotavg_ros.replay import left_waiting
 from rotavg_ros.replay.feed import Feed
 from rotavg_ros.replay.frames import BagFrames
@@ -25,6 +24,7 @@ from rotavg_ros.replay.pace import Pace
 from rotavg_ros.replay.plan import Plan
 from rotavg_ros.replay.record import TickRecord
 from rotavg_ros.replay.recording import Recording
+from rotavg_ros.stamps import NANOSECONDS
 
 _NAP_S = 0.1
 

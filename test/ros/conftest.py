@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
+from forked_node import ForkedNode, can_fork
 from geometry_msgs.msg import Quaternion, QuaternionStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
@@ -35,6 +36,10 @@ class RunningProcess:
 
     def __init__(self, command: list[str | Path], output_file: Path) -> None:
         self._output_file = output_file
+        self._process: subprocess.Popen[bytes] | ForkedNode
+        if command[0] == NODE and can_fork():
+            self._process = ForkedNode([str(word) for word in command[1:]], output_file)
+            return
         with output_file.open("wb") as sink:
             self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=sink, stderr=subprocess.STDOUT)
 

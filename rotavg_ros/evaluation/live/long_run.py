@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.evaluation.common.tables import Column, Table
 from rotavg_ros.online import Answer, EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator, free_memory
-from rotavg_ros.online.options import NANOSECONDS
+from rotavg_ros.stamps import NANOSECONDS
 
 _RATE_HZ = 50
 _LAP_S = 200.0

@@ -18,7 +18,7 @@ from rosgraph_msgs.msg import Clock
 
 from rotavg_ros.bags.reader import BagMessage, BagReader
 from rotavg_ros.errors import UserError
-from rotavg_ros.online.options import NANOSECONDS
+from rotavg_ros.stamps import NANOSECONDS
 
 # Number of messages that a publisher keeps for retransmission. Fast DDS asks its readers what they lack every 3 s.
 _DEPTH = 10_000

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 
@@ -56,19 +57,20 @@ def test_somebodys_own_graph_without_truth(tmp_path: Path, start_process: Callab
         (["--rate", "nan"], "--rate: is nan; it must be 0 or more"),
     ],
 )
-def test_mistakes_are_one_line(tmp_path: Path, start_process: Callable, options: list[str], complaint: str) -> None:
-    demo = start_process(*ROTAVG, "demo", "--output", tmp_path / "demo", *options)
-    assert demo.wait() == 2
-    assert complaint in demo.output
-    assert demo.output.count("\n") == 1
+def test_mistakes_are_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], complaint: str
+) -> None:
+    assert main(["demo", "--output", str(tmp_path / "demo"), *options]) == 2
+    said = capsys.readouterr()
+    assert complaint in said.err
+    assert (said.out, said.err.count("\n")) == ("", 1)
     assert not (tmp_path / "demo").exists()
 
 
-def test_an_output_in_use_is_kept(tmp_path: Path, start_process: Callable) -> None:
+def test_an_output_in_use_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "thesis.tex").write_text("")
-    demo = start_process(*ROTAVG, "demo", "--output", tmp_path)
-    assert demo.wait() == 2
-    assert "exists already" in demo.output
+    assert main(["demo", "--output", str(tmp_path)]) == 2
+    assert "exists already" in capsys.readouterr().err
 
 
 def children_of(pid: int) -> list[int]:

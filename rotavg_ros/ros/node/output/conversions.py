@@ -13,8 +13,8 @@ from rotavg_msgs.msg import AbsoluteOrientations, OutlierFlags
 from std_msgs.msg import Header
 
 from rotavg_ros.online import Answer
-from rotavg_ros.online.options import NANOSECONDS
 from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.stamps import NANOSECONDS
 
 
 def to_time(stamp_ns: int) -> Time:

@@ -17,12 +17,12 @@ from rotavg_ros.inputs import OdometryRecord
 from rotavg_ros.online import OnlineEstimator, quaternion
 from rotavg_ros.online.answer.gradual import CorrectionRates, GradualFrame
 from rotavg_ros.online.answer.odometry_frame import OdometryFrame
-from rotavg_ros.online.options import NANOSECONDS
 from rotavg_ros.online.quaternion import Vector
 from rotavg_ros.ros.node.output.conversions import to_quaternion_message
 from rotavg_ros.ros.node.output.frame_correction import FrameCorrection
 from rotavg_ros.ros.node.topics import publisher
 from rotavg_ros.settings.parameters import NodeParameters
+from rotavg_ros.stamps import NANOSECONDS
 
 # Variance of unknown quantities, in rad² or m², or these per s²: large enough that a filter practically ignores them.
 UNKNOWN_VARIANCE = 1e6
