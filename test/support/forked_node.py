@@ -13,7 +13,13 @@ from collections.abc import Sequence
 from multiprocessing import get_context
 from pathlib import Path
 
-_IMPORTED = ["rclpy", "rotavg_ros.ros.node.estimator_node", "rotavg_ros.online.solver_process.server"]
+_IMPORTED = [
+    "numba",
+    "rclpy",
+    "rotavg_ros.ros.node.estimator_node",
+    "rotavg_ros.online.solver_process.server",
+    "rotavg_ros.solver.pipeline",
+]
 # Where libraries and modules are found is settled when a process starts.
 _PATHS = ("AMENT_PREFIX_PATH", "LD_LIBRARY_PATH", "PYTHONPATH")
 
