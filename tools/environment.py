@@ -109,8 +109,8 @@ def install_requirements() -> bool:
         if stale:
             say("installing the pinned requirements (some minutes and 2 GB the first time)")
             files = [argument for file in REQUIREMENTS for argument in ("--requirement", file)]
+            # Python compiles what is imported, when it first is; most never is.
             pip("install", "--no-compile", "--constraint", CONSTRAINTS, *files)
-            compile_bytecode()
             python_include = ask_venv("import sysconfig; print(sysconfig.get_paths()['include'])")[0]
             numpy_include = ask_venv("import numpy; print(numpy.get_include())")[0]
             repair_cmake_exports(VENV, Path(python_include), Path(numpy_include))
@@ -139,8 +139,10 @@ def prepare_tests() -> bool:
     """Build everything, while numba takes one core, and code generators at most the other."""
     with ThreadPoolExecutor() as pool:
         loops = pool.submit(compile_loops)
-        done = [build_workspace(), build_test_interfaces()]
-    return any((*done, loops.result()))
+        done = [build_workspace()]
+        tests = pool.submit(collect_tests)
+        done += [build_test_interfaces()]
+    return any((*done, loops.result(), tests.result()))
 
 
 def build_test_interfaces() -> bool:
@@ -170,6 +172,18 @@ def compile_loops() -> bool:
         if stale:
             say("compiling the solver's loops for the tests")
             command = [str(VENV / "bin" / "python"), str(program)]
+            subprocess.run(command, cwd=ROOT, env=clean_environment(), check=False, capture_output=True)
+    return stale
+
+
+def collect_tests() -> bool:
+    """Have Python compile what tests import, and pytest rewrite them; else each process of a first run does both.
+
+    If it fails, the tests tell why.
+    """
+    with stamp("bytecode", [*REQUIREMENTS, CONSTRAINTS]) as stale:
+        if stale:
+            command = [str(VENV / "bin" / "python"), "-m", "pytest", "--collect-only", "-q"]
             subprocess.run(command, cwd=ROOT, env=clean_environment(), check=False, capture_output=True)
     return stale
 
@@ -207,16 +221,6 @@ def ask_venv(code: str) -> list[str]:
     """The lines that a short program prints in the virtual environment; none if it fails."""
     answer = subprocess.run([str(VENV / "bin" / "python"), "-c", code], capture_output=True, text=True, check=False)
     return answer.stdout.splitlines()
-
-
-def compile_bytecode() -> None:
-    """Compile what is installed, on all cores; pip takes a minute for it on one. What no Python can compile is left.
-
-    Packages' own tests are a quarter of it, and nobody imports them.
-    """
-    folders = VENV.glob("lib/python3.*/site-packages")
-    command = [str(VENV / "bin" / "python"), "-m", "compileall", "-q", "-j", "0", "-x", "/tests/", *map(str, folders)]
-    subprocess.run(command, env=clean_environment(), check=False, capture_output=True)
 
 
 def pip(*arguments: str | Path) -> None:
