@@ -90,13 +90,12 @@ def _whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     if "translations" not in stages.without and has_places(graph):
         with run.watch.stage("poses"):
             poses, mode = median_poses(calibrated(graph, found.calibration), found.modes, tune)
-    is_divided = bool(published.warnings) if poses is None else poses.poses.is_divided
     # The posterior's warning is about rivals by rotations alone; translations may have decided between them.
-    told = estimate.warnings if is_divided else ()
+    told = estimate.warnings if poses is None else poses.poses.warnings
     jumps = () if poses is None else jump_warnings(poses.pose)
     estimate = replace(estimate, warnings=(*told, *notes_of(mode, found.suspected), *jumps))
     if stages == SlamStages():
-        memory = SlamMemory.of(graph, found.calibration, mode, estimate, is_divided)
+        memory = SlamMemory.of(graph, found.calibration, mode, estimate, bool(told))
         estimate = replace(estimate, memory=memory)
     return estimate if poses is None else with_poses(graph, estimate, poses)
 

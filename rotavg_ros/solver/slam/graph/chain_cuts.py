@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from rotavg_ros.solver.algebra.minimum_cut import FlowNetwork
 
@@ -20,6 +22,12 @@ def with_most_runs(agree: np.ndarray, run: np.ndarray) -> int:
     first = np.unique(run[order], return_index=True)[1]
     runs = np.logical_or.reduceat(agree[:, order], first, axis=1).sum(axis=1)
     return int(np.lexsort((-agree.sum(axis=1), -runs))[0])
+
+
+def connected(count: int, ends: np.ndarray) -> np.ndarray:
+    """``(n,)`` number of the connected component of each of n = ``count`` chains; closures join ``(B, 2)``."""
+    links = coo_array((np.ones(len(ends)), ends.T), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1])
 
 
 @dataclass(frozen=True)

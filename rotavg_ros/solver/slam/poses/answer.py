@@ -10,9 +10,14 @@ from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
 from rotavg_ros.solver.slam.poses.row_errors import bridge_variance, closure_turns, mean_over_axes, mean_turn
 from rotavg_ros.solver.slam.poses.solved import PoseMode
-from rotavg_ros.solver.slam.posterior.publishing.modes import FAR_TURN, LIKELY, median
+from rotavg_ros.solver.slam.posterior.publishing.modes import FAR_TURN, LIKELY, median, warning_of_rivals
 from rotavg_ros.solver.slam.stages import outlier_scores
 from rotavg_ros.view_graph import FALSE_CLOSURE_M
+
+# A warning is given for rivals that move a node by more than this many standard deviations, and than a false closure is
+# off.
+_FAR_SHIFT = 5.0
+_FALSE = 0.5
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,7 @@ class Poses:
         outlier_probability: ``(M,)`` that a closure is false, in rotation or place; that odometry's position jumped.
         rotation_probability: ``(M,)`` that a closure's rotation is false; that odometry slipped.
         precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count; 0 for unknown translations.
-        is_divided: whether another labelling is nearly as likely in which a part of the map is turned.
+        warnings: of other labellings that are nearly as likely, in which a part of the map is turned or moved.
     """
 
     body_from_world: np.ndarray
@@ -37,7 +42,7 @@ class Poses:
     outlier_probability: np.ndarray
     rotation_probability: np.ndarray
     precision: np.ndarray
-    is_divided: bool = False
+    warnings: tuple[str, ...] = ()
 
 
 def answer(rivals: list[PoseMode], share: np.ndarray) -> tuple[Poses, int]:
@@ -58,7 +63,6 @@ def answer(rivals: list[PoseMode], share: np.ndarray) -> tuple[Poses, int]:
     def mixed(name: str) -> np.ndarray:
         return np.tensordot(share, np.array([getattr(other, name) for other in single]), 1)
 
-    farthest = np.sqrt((turns**2).sum(axis=1).max(axis=1))
     poses = Poses(
         chosen.body_from_world,
         chosen.position,
@@ -67,9 +71,38 @@ def answer(rivals: list[PoseMode], share: np.ndarray) -> tuple[Poses, int]:
         np.clip(mixed("outlier_probability"), 0.0, 1.0),
         np.clip(mixed("rotation_probability"), 0.0, 1.0),
         mixed("precision"),
-        bool(((share >= LIKELY) & (farthest > FAR_TURN)).any()),
+        _warnings(rivals[middle].problem.graph.is_odometry.numpy(), single, chosen, share, turns),
     )
     return poses, middle
+
+
+def _warnings(
+    is_odometry: np.ndarray, rivals: list[Poses], chosen: Poses, share: np.ndarray, turns: np.ndarray
+) -> tuple[str, ...]:
+    """Warnings about the differences between rivals, if a likely one turns or moves a part of the map by far.
+
+    Args:
+        is_odometry: ``(M,)`` bool.
+        rivals, chosen: each one's answer, and that which is published.
+        share: their probabilities.
+        turns: ``(R, 3, N)`` rad, by which each rival's orientations differ from the published ones.
+    """
+    turned = np.sqrt((turns**2).sum(axis=1)).max(axis=1)
+    moved = np.array([np.linalg.norm(other.position - chosen.position, axis=1) for other in rivals])
+    beyond = moved * (moved > _FAR_SHIFT * np.sqrt(chosen.position_variance))
+    shifted = beyond.max(axis=1, initial=0.0)
+    is_turned, is_shifted = turned > FAR_TURN, shifted > FALSE_CLOSURE_M
+    others = np.flatnonzero((share >= LIKELY) & (is_turned | is_shifted))
+    if len(others) == 0:
+        return ()
+    false = np.array([other.outlier_probability > _FALSE for other in rivals])
+    differs = (false[others] != (chosen.outlier_probability > _FALSE)).any(axis=0)
+    changes = [f"turn parts of the map by up to {np.degrees(turned[others].max()):.0f}°"] * bool(
+        is_turned[others].any()
+    )
+    changes += [f"move parts of the map by up to {shifted[others].max():.1f} m"] * bool(is_shifted[others].any())
+    closures, steps = int(differs[~is_odometry].sum()), int(differs[is_odometry].sum())
+    return (warning_of_rivals(float(share[others].sum()), closures, steps, " and ".join(changes)),)
 
 
 def _of_mode(pose: PoseMode) -> Poses:

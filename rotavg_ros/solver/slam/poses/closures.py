@@ -195,9 +195,9 @@ class Places:
         """``(C,)`` probability that a closure joins the right places by the right rotation."""
         return np.asarray(self.chance[:GOOD].sum(axis=0))
 
-    def is_like(self, other: Places) -> bool:
-        """Whether the same closures join the right places."""
-        return bool((np.abs(self.right - other.right) < _OTHERWISE).all())
+    def is_like(self, other: Places, among: np.ndarray | slice = slice(None)) -> bool:
+        """Whether the same closures join the right places, of all or ``among`` some of them."""
+        return bool((np.abs(self.right - other.right)[among] < _OTHERWISE).all())
 
     @property
     def rotation_good(self) -> np.ndarray:

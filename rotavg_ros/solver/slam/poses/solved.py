@@ -80,6 +80,11 @@ class PoseMode:
         """Poses of the key nodes, and the noise."""
         return self.solved.state
 
+    def is_joined_like(self, other: PoseMode) -> bool:
+        """Whether the same closures between chains of odometry join the right places."""
+        joins = ~self.problem.within_chain
+        return self.solved.places.is_like(other.solved.places, joins)
+
     def jumps_like(self, other: PoseMode) -> bool:
         """Whether odometry's position jumps in the same segments."""
         return np.array_equal(self.problem.jumps > 0, other.problem.jumps > 0)

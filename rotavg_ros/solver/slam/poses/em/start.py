@@ -50,11 +50,10 @@ class PoseStart:
 
         Closures whose rotations are labelled differently are judged anew.
         """
-        closure, noise = problem.mode.problem.closure, pose.state.noise
+        closure = problem.mode.problem.closure
         is_same = problem.mode.state.is_good[closure] == pose.problem.mode.state.is_good[closure]
         column = np.where(is_same, np.arange(len(closure)), -1)
-        state = replace(along_odometry(problem), noise=noise, shape=pose.state.shape)
-        return cls(state, column, pose.solved.places, MAX_SOLVES)
+        return cls(pose.state, column, pose.solved.places, MAX_SOLVES).along_odometry(problem)
 
     @classmethod
     def believing(cls, pose: PoseMode, closures: np.ndarray) -> PoseStart:
@@ -93,6 +92,11 @@ class PoseStart:
             np.where(is_doubted, held.weight, begun.weight),
         )
         return replace(cls.at(pose), places=replace(begun, chance=chance, weight=weight))
+
+    def along_odometry(self, problem: PoseProblem) -> PoseStart:
+        """The same for another labelling, from rotations alone."""
+        state = replace(along_odometry(problem), noise=self.state.noise, shape=self.state.shape)
+        return replace(self, state=state)
 
     @classmethod
     def kept(cls, problem: PoseProblem, kept: np.ndarray, noise: np.ndarray) -> PoseStart | None:

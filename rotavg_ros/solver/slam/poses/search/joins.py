@@ -2,27 +2,31 @@
 
 Nothing but these closures tells where one chain lies beside another. Those that are believed first hold the chain in
 place, all that say otherwise are then judged wrong because of them, and no single one of these, nor a run, can move the
-whole chain against the others. So for each group of such closures that agree about where the chain lies, poses are
-estimated with that group believed and all that contradict it doubted, and −log p decides.
+whole chain against the others. So for each group of such closures that agree about how the chain should move, poses are
+estimated with that group believed and all that contradict it doubted, and −log p decides. Where it should turn as well,
+rotations are solved anew before.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from rotavg_ros.solver.running.work import rest, stop_if_abandoned
-from rotavg_ros.solver.slam.graph.chain_cuts import ChainCuts, with_most_runs
+from rotavg_ros.solver.slam.graph.chain_cuts import ChainCuts, connected, with_most_runs
 from rotavg_ros.solver.slam.graph.evenly import evenly
+from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
-from rotavg_ros.solver.slam.poses.row_errors import stated_variance
-from rotavg_ros.solver.slam.poses.search.settling import LEAST_GAIN, Rival, moved
+from rotavg_ros.solver.slam.poses.search.motions import Motions
+from rotavg_ros.solver.slam.poses.search.settling import LEAST_GAIN, NEAR, Rival, moved, settling
 from rotavg_ros.solver.slam.poses.solved import PoseMode
+from rotavg_ros.solver.slam.posterior.em import polish
+from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.solver.slam.posterior.moves.turning import sides_turned, trusted_after_turn
 
 _WRONG = 0.5
-# Two closures agree about where a chain lies if they differ by less than this many standard deviations.
-_ALIKE = 3.0
 # Maximum number of rounds; of joins that are tried in each, those of most runs first; and of closures compared.
 _MAX_ROUNDS, _MAX_JOINS, _MAX_COMPARED = 8, 8, 1000
 
@@ -33,23 +37,57 @@ class Join(NamedTuple):
     Attributes:
         believed: closures that agree about where one lies beside the other.
         doubted: closures without which nothing else joins the two.
+        moving, resting: ``(K,)`` bool, key nodes that move, and those that they move against.
+        turn: ``(4, 1)`` by which the corrections of ``moving`` turn.
     """
 
     believed: np.ndarray
     doubted: np.ndarray
+    moving: np.ndarray
+    resting: np.ndarray
+    turn: np.ndarray
 
 
-def joined_otherwise(rival: Rival) -> Rival:
-    """The same labelling with chains placed by other closures, by those first that make all likeliest."""
+def joined_otherwise(rival: Rival) -> list[Rival]:
+    """The labelling with chains placed by other closures, by those first that make all likeliest.
+
+    Returns:
+        The likeliest, ``rival`` itself if none is likelier; and others that are nearly as likely.
+    """
     if "joins" in rival.mode.problem.without:
-        return rival
+        return [rival]
+    tried = [rival]
     for _ in range(_MAX_ROUNDS):
-        placed = [moved(rival, PoseStart.joining(rival.pose, *join)) for join in other_joins(rival.pose)]
+        placed = [_placed(rival, join) for join in other_joins(rival.pose)]
+        tried += [each for each in placed if each is not rival]
         likeliest = min(placed, key=lambda each: each.cost, default=rival)
         if not likeliest.cost < rival.cost - LEAST_GAIN:
             break
         rival = likeliest
-    return rival
+    distinct = [rival]
+    for each in sorted(tried, key=lambda each: each.cost):
+        is_near = each.cost <= rival.cost + NEAR
+        if is_near and not any(each.pose.is_joined_like(other.pose) for other in distinct):
+            distinct.append(each)
+    return distinct
+
+
+def _placed(rival: Rival, join: Join) -> Rival:
+    pose = rival.pose
+    if (pose.solved.places.rotation_good[join.believed] > _WRONG).all():
+        return moved(rival, PoseStart.joining(pose, join.believed, join.doubted))
+    problem = replace(pose.problem, mode=_turned(rival.mode, join))
+    start = PoseStart.joining(pose, join.believed, join.doubted).along_odometry(problem)
+    return settling(estimate_poses(problem, start=start), rival.cost)
+
+
+def _turned(mode: Mode, join: Join) -> Mode:
+    """The labelling of rotations that a way to join chains implies."""
+    problem = mode.problem
+    state = sides_turned(mode, join.moving, join.resting, join.turn)
+    trusted = trusted_after_turn(mode, state)
+    trusted[problem.closure[join.doubted]], trusted[problem.closure[join.believed]] = 0.0, 1.0
+    return Mode(problem, *polish(problem, replace(state, trusted=trusted)), mode.origin)
 
 
 def other_joins(pose: PoseMode) -> list[Join]:
@@ -59,24 +97,19 @@ def other_joins(pose: PoseMode) -> list[Join]:
     there several times; not where it has fewer runs than the closures that would have to be wrong.
     """
     problem, places, told = pose.problem, pose.solved.places, pose.problem.told
-    closure, drawn, k = problem.mode.problem.closure, problem.drawn, problem.turns
-    chain = np.stack((drawn.chain[drawn.source[closure]], drawn.chain[drawn.target[closure]]), axis=1)
-    joins = np.flatnonzero((chain[:, 0] != chain[:, 1]) & told.is_known & (told.label == 0))
-    could = joins[(places.right[joins] < _WRONG) & (places.rotation_good[joins] > _WRONG)]
+    closure, drawn = problem.mode.problem.closure, problem.drawn
+    names, number = np.unique(drawn.chain, return_inverse=True)
+    ends = number[np.stack((drawn.source[closure], drawn.target[closure]), axis=1)]
+    joins = np.flatnonzero((ends[:, 0] != ends[:, 1]) & told.is_known & (told.label == 0))
+    could = joins[places.right[joins] < _WRONG]
     could = evenly(could[np.argsort(told.detected[could])], _MAX_COMPARED)
     if len(could) == 0:
         return []
-    # By how much the chain of the higher number would move, and with which variance, lever arms included.
-    sign = np.where(chain[could, 0] < chain[could, 1], 1.0, -1.0)
-    shift = sign[:, None] * pose.solved.predictions.mean[could, k:]
-    spread = np.diagonal(pose.solved.predictions.covariance[could][:, k:, k:], axis1=1, axis2=2).mean(axis=1)
-    variance = spread + stated_variance(problem, pose.state)[could]
-    pair = np.sort(chain[could], axis=1)
-    square = ((shift[:, None] - shift[None]) ** 2).sum(axis=2) / (variance[:, None] + variance[None])
-    alike = (square < _ALIKE**2 * shift.shape[1]) & (pair[:, None] == pair[None]).all(axis=2)
-    names, ends = np.unique(chain[joins], return_inverse=True)
-    ends, is_believed = ends.reshape(-1, 2), places.right[joins] > _WRONG
-    cuts = ChainCuts.of(len(names), ends[is_believed], told.run[joins[is_believed]])
+    pair, motions = np.sort(ends[could], axis=1), Motions.of(pose, could)
+    alike = motions.agree(problem.turns, problem.shifts) & (pair[:, None] == pair[None]).all(axis=2)
+    believing = joins[places.right[joins] > _WRONG]
+    cuts, component = ChainCuts.of(len(names), ends[believing], told.run[believing]), connected(len(names), ends)
+    alone = np.eye(len(names), dtype=bool)
     found: list[Join] = []
     is_left = np.ones(len(could), dtype=bool)
     while is_left.any() and len(found) < _MAX_JOINS:
@@ -85,13 +118,14 @@ def other_joins(pose: PoseMode) -> list[Join]:
         seed = with_most_runs(alike & is_left & is_left[:, None], told.run[could])
         members = alike[seed] & is_left
         is_left &= ~members
-        believed, before = could[members], len(found)
-        first, second = np.searchsorted(names, pair[seed])
-        across = [beyond[ends[:, 0]] != beyond[ends[:, 1]] for beyond in cuts.beyond(first, second)]
-        for is_doubted in (*across, *((ends == end).any(axis=1) for end in (first, second))):
-            doubted = np.setdiff1d(joins[is_doubted], believed)
+        believed, before, (first, second) = could[members], len(found), pair[seed]
+        is_near = component == component[first]
+        for beyond in (*cuts.beyond(first, second), ~alone[first], alone[second]):
+            crossing = joins[beyond[ends[joins, 0]] != beyond[ends[joins, 1]]]
+            doubted = np.setdiff1d(crossing, believed)
             contradicted = doubted[places.right[doubted] > _WRONG]
             is_enough = len(np.unique(told.run[believed])) >= len(np.unique(told.run[contradicted]))
             if is_enough and not any(np.array_equal(doubted, other.doubted) for other in found[before:]):
-                found.append(Join(believed, doubted))
+                moving, resting = (beyond & is_near)[number], (~beyond & is_near)[number]
+                found.append(Join(believed, doubted, moving, resting, motions.turn[:, [seed]]))
     return found

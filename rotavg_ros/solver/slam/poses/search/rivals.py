@@ -16,14 +16,14 @@ from rotavg_ros.solver.slam.poses.search.beginnings import begun_at_runs
 from rotavg_ros.solver.slam.poses.search.joins import joined_otherwise
 from rotavg_ros.solver.slam.poses.search.jumps import jumps_too_far, likeliest_jump, with_jump, without_odd_jumps
 from rotavg_ros.solver.slam.poses.search.runs import with_runs, without_runs
-from rotavg_ros.solver.slam.poses.search.settling import HOPELESS, SLACK, Rival, settled, settling
+from rotavg_ros.solver.slam.poses.search.settling import HOPELESS, NEAR, SLACK, Rival, settled, settling
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
 
-# Maximum number of rival labellings compared by their translations; largest distance, nats, by rotations alone from the
-# likeliest labelling, or the likeliest without slips; and largest final distance, nats, of rivals published together.
-_MAX_RIVALS, _FARTHEST, _FAR = 8, 20.0, 5.0
+# Maximum number of rival labellings compared by their translations; and largest distance, nats, by rotations alone from
+# the likeliest labelling, or the likeliest without slips.
+_MAX_RIVALS, _FARTHEST = 8, 20.0
 # Maximum number of labellings in which whole runs are believed or doubted.
 _MAX_ASKED = 3
 # Maximum number of jumps.
@@ -70,7 +70,7 @@ def rival_poses(
     ended.extend(_with_other_runs(_distinct(ended, HOPELESS)[:_MAX_ASKED]))
     ended.append(begun_at_runs(min(ended, key=lambda rival: rival.cost)))
     ended.extend(_jumping(min(ended, key=lambda rival: rival.cost)))
-    rivals = _distinct(ended, _FAR)
+    rivals = _distinct(ended, NEAR)
     cost = np.array([rival.cost for rival in rivals])
     share = np.exp(cost[0] - cost)
     poses: list[PoseMode] = []
@@ -105,6 +105,8 @@ def _distinct(ended: Sequence[Rival], farthest: float) -> list[Rival]:
 def _with_other_runs(rivals: Sequence[Rival]) -> list[Rival]:
     """The rivals that are likelier with chains joined by other closures, or with whole runs believed or doubted.
 
+    Also those with chains joined otherwise that are nearly as likely.
+
     A rival is skipped if this changed nothing in another one with nearly the same labels.
     """
     found: list[Rival] = []
@@ -112,8 +114,10 @@ def _with_other_runs(rivals: Sequence[Rival]) -> list[Rival]:
     for rival in rivals:
         if any(rival.mode.holds_like(other.mode.state) for other in unmoved):
             continue
-        other = without_runs(with_runs(joined_otherwise(rival)))
+        joined, *near = joined_otherwise(rival)
+        other = without_runs(with_runs(joined))
         (unmoved if other is rival else found).append(other)
+        found += near
     return found
 
 

@@ -22,6 +22,8 @@ from rotavg_ros.solver.slam.posterior.mode import Mode
 # Maximum number of rounds of relabelling; least decrease of −log p for another round, nats; and distance from the least
 # −log p so far at which a labelling is given up, nats.
 _ROUNDS, LEAST_GAIN, HOPELESS = 4, 0.1, 20.0
+# Largest distance from the least −log p, nats, of labellings that are published together.
+NEAR = 5.0
 _GOOD = 0.5
 # Another start is tried if −log p is predicted to rise by no more than this, nats: the gain is predicted for each
 # closure independently, and a jump that was predicted to lose 4 gained 62.
@@ -46,8 +48,9 @@ class Rival:
         return self.mode.cost + self.pose.cost - log_jump_prior(self.pose.problem)
 
     def is_same(self, other: Rival) -> bool:
-        """Whether both have the same labels."""
-        return self.mode.labels == other.mode.labels and self.pose.jumps_like(other.pose)
+        """Whether both have the same labels, and chains that the same closures join."""
+        is_labelled_alike = self.mode.labels == other.mode.labels
+        return is_labelled_alike and self.pose.jumps_like(other.pose) and self.pose.is_joined_like(other.pose)
 
 
 def settling(pose: PoseMode, least: float = np.inf) -> Rival:

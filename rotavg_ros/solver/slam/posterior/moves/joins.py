@@ -11,24 +11,15 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.slam.graph.chain_cuts import ChainCuts, with_most_runs
+from rotavg_ros.solver.slam.graph.chain_cuts import ChainCuts, connected, with_most_runs
 from rotavg_ros.solver.slam.graph.evenly import evenly
 from rotavg_ros.solver.slam.posterior.em import settle
 from rotavg_ros.solver.slam.posterior.left_out import rough_cost
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
-from rotavg_ros.solver.slam.posterior.moves.slips import (
-    AGREE,
-    AGREE_ANGLE,
-    OPTIMISM,
-    SETTLING,
-    trusted_after_turn,
-    turned_by,
-)
-from rotavg_ros.solver.slam.posterior.state import State
+from rotavg_ros.solver.slam.posterior.moves.slips import AGREE, AGREE_ANGLE, OPTIMISM, SETTLING
+from rotavg_ros.solver.slam.posterior.moves.turning import sides_turned, trusted_after_turn
 
 # Maximum number of false closures of which it is counted how many agree with each.
 _MAX_TRIED = 256
@@ -62,7 +53,9 @@ def propose_joins(mode: Mode) -> Iterator[Proposal]:
         held = joins & ~mode.is_false & ~((low == low[seed]) & (high == high[seed]) & ~agrees)
         pair = int(low[seed]), int(high[seed])
         for chains in _sides(int(number.max()) + 1, ends, np.flatnonzero(held), problem.run, pair):
-            state = _turned(mode, chains[:, number], turned[:, [seed]])
+            moving, resting = chains[:, number]
+            state = sides_turned(mode, moving, resting, turned[:, [seed]])
+            state = replace(state, trusted=trusted_after_turn(mode, state))
             predicted = rough_cost(problem, state) - before - OPTIMISM
             yield Proposal("join otherwise", predicted, partial(settle, problem, state, SETTLING), problem.limits.slack)
 
@@ -80,12 +73,7 @@ def _sides(count: int, ends: np.ndarray, held: np.ndarray, run: np.ndarray, pair
         run: ``(C,)`` the closures' runs.
         pair: lower and higher chain; the higher one turns against the lower one.
     """
-
-    def parts(joined: np.ndarray) -> np.ndarray:
-        links = coo_array((np.ones(joined.shape[1]), joined), shape=(count, count))
-        return np.asarray(connected_components(links, directed=False)[1])
-
-    component, part = parts(ends), parts(ends[:, held])
+    component, part = connected(count, ends.T), connected(count, ends[:, held].T)
     is_near = component == component[pair[0]]
     if part[pair[0]] != part[pair[1]]:
         turning = [part == part[pair[1]]]
@@ -94,12 +82,3 @@ def _sides(count: int, ends: np.ndarray, held: np.ndarray, run: np.ndarray, pair
         turning = [*ChainCuts.of(count, ends[:, held].T, run[held]).beyond(*pair), alone[1], ~alone[0]]
     sides = [np.stack((is_near & beyond, is_near & ~beyond)) for beyond in turning]
     return [side for number, side in enumerate(sides) if not any(np.array_equal(side, one) for one in sides[:number])]
-
-
-def _turned(mode: Mode, sides: np.ndarray, turn: np.ndarray) -> State:
-    """The state with one side ``(2, K)`` turned against the other: the one without a root, which is fixed."""
-    first, second = sides
-    if first[mode.problem.graph.roots].any():
-        first, turn = second, quaternion_rows.inverse(turn)
-    state = turned_by(mode, first, turn)
-    return replace(state, trusted=trusted_after_turn(mode, state))

@@ -13,8 +13,9 @@ from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.em import settle
 from rotavg_ros.solver.slam.posterior.labels.false_closures import false_density, log_false_set
 from rotavg_ros.solver.slam.posterior.labels.prior import log_label_prior, log_slip_odds
-from rotavg_ros.solver.slam.posterior.left_out import relabelled, rough_cost
+from rotavg_ros.solver.slam.posterior.left_out import rough_cost
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
+from rotavg_ros.solver.slam.posterior.moves.turning import part_turned, trusted_after_turn
 from rotavg_ros.solver.slam.posterior.rows import variances
 from rotavg_ros.solver.slam.posterior.state import State
 
@@ -213,29 +214,8 @@ def propose_shifts(mode: Mode) -> Iterator[Proposal]:
                 yield Proposal("shift", predicted, partial(settle, mode.problem, state, SETTLING), limits.rival)
 
 
-def turned_by(mode: Mode, nodes: np.ndarray, turn: np.ndarray) -> State:
-    """The mode's state with some key nodes, ``(K,)`` bool, turned by ``turn`` ``(4, 1)``."""
-    correction = mode.state.correction.copy()
-    correction[:, nodes] = quaternion_rows.multiply(correction[:, nodes], turn)
-    return replace(mode.state, correction=correction)
-
-
-def trusted_after_turn(mode: Mode, state: State, *, may_mend: bool = False) -> np.ndarray:
-    """``(E,)`` labels after a part was turned: closures get the label that their residual favours, odometry keeps its.
-
-    Args:
-        mode: the labelling before.
-        state: the state after the turn.
-        may_mend: whether slips that their residual no longer favours become sound.
-    """
-    odometry, trusted = mode.problem.graph.is_odometry, relabelled(mode.problem, state)
-    kept = mode.state.trusted[odometry]
-    trusted[odometry] = np.maximum(kept, trusted[odometry]) if may_mend else kept
-    return trusted
-
-
 def _with_slip(mode: Mode, edge: int, turn: np.ndarray) -> State:
-    state = turned_by(mode, mode.problem.graph.behind(edge), turn)
+    state = part_turned(mode, mode.problem.graph.behind(edge), turn)
     trusted = trusted_after_turn(mode, state)
     trusted[edge] = 0.0
     return settle(mode.problem, replace(state, trusted=trusted), SETTLING)
@@ -255,9 +235,9 @@ def _shifted(mode: Mode, edge: int, other: int, *, is_later: bool) -> State:
     turn = _turn_of(mode, edge)
     behind, behind_other = (mode.problem.graph.behind(each) for each in (edge, other))
     if is_later:
-        state = turned_by(mode, behind & ~behind_other, turn)
+        state = part_turned(mode, behind & ~behind_other, turn)
     else:
-        state = turned_by(mode, behind_other & ~behind, quaternion_rows.inverse(turn))
+        state = part_turned(mode, behind_other & ~behind, quaternion_rows.inverse(turn))
     trusted = trusted_after_turn(mode, state)
     trusted[edge], trusted[other] = 1.0, 0.0
     return replace(state, trusted=trusted)
@@ -268,7 +248,7 @@ def _mended(mode: Mode, edge: int, following: int | None) -> State:
     nodes = graph.behind(edge)
     if following is not None:
         nodes &= ~graph.behind(following)
-    state = turned_by(mode, nodes, _turn_of(mode, edge))
+    state = part_turned(mode, nodes, _turn_of(mode, edge))
     trusted = trusted_after_turn(mode, state, may_mend=True)
     trusted[edge] = 1.0
     return replace(state, trusted=trusted)

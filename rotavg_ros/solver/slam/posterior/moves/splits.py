@@ -23,9 +23,8 @@ from rotavg_ros.solver.slam.posterior.moves.slips import (
     SAME_PLACE,
     SETTLING,
     Witnesses,
-    trusted_after_turn,
-    turned_by,
 )
+from rotavg_ros.solver.slam.posterior.moves.turning import part_turned, trusted_after_turn
 from rotavg_ros.solver.slam.posterior.state import State
 
 
@@ -127,7 +126,7 @@ def _over(witnesses: Witnesses, change: np.ndarray, begin: np.ndarray | None, en
 def _split(mode: Mode, part: _Part) -> State:
     """The state with the part turned and its segment slipped; the old slip stays one only if its residual says so."""
     graph = mode.problem.graph
-    state = turned_by(mode, graph.behind(part.slip) ^ graph.behind(part.segment), part.turn)
+    state = part_turned(mode, graph.behind(part.slip) ^ graph.behind(part.segment), part.turn)
     trusted = trusted_after_turn(mode, state, may_mend=True)
     trusted[part.segment] = 0.0
     return replace(state, trusted=trusted)

@@ -116,10 +116,16 @@ def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: li
     differs = np.any([rivals[number].state.is_good != rivals[0].state.is_good for number in others], axis=0)
     closures, steps = int(differs[problem.closure].sum()), int(differs[problem.graph.is_odometry].sum())
     turned = np.degrees(max(largest[number] for number in others))
+    change = f"turn parts of the map by up to {turned:.0f}°"
+    return (warning_of_rivals(float(share[others].sum()), closures, steps, change),)
+
+
+def warning_of_rivals(share: float, closures: int, steps: int, change: str) -> str:
+    """The warning that answers of this probability in all judge some edges differently, and what that changes."""
     return (
-        f"Other answers are nearly as likely ({100 * share[others].sum():.0f} %): they judge {closures} closures and "
-        f"{steps} stretches of odometry differently, and turn parts of the map by up to {turned:.0f}°. The published "
-        "orientations are the median of all: look at their uncertainty, and label the closures that you know.",
+        f"Other answers are nearly as likely ({100 * share:.0f} %): they judge {closures} closures and {steps} "
+        f"stretches of odometry differently, and {change}. The published orientations are the median of all: look at "
+        "their uncertainty, and label the closures that you know."
     )
 
 
