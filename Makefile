@@ -16,15 +16,16 @@ demo: setup
 		$(if $(STAMPS),--stamps "$(STAMPS)")
 
 # make test [ARGS="-k node -x"]; without ARGS several files at a time (those over DDS mostly wait, and have few tests each:
-# by number of tests they would come last), without those of test-large
+# by number of tests they would come last), without those of test-large. Each has one thread: several processes' threads
+# would wait for each other's cores, and they do so by spinning, which takes several times the time.
 test:
 	@$(PYTHON) tools/setup_environment.py --for-tests
-	@$(BIN)/python -m pytest $(if $(strip $(ARGS)),$(ARGS),$(AT_A_TIME) -m "not large")
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(strip $(ARGS)),$(ARGS),$(AT_A_TIME) -m "not large")
 
 # After a change of solver, online or node, and before a release.
 test-large:
 	@$(PYTHON) tools/setup_environment.py --for-tests
-	@$(BIN)/python -m pytest $(AT_A_TIME) -m large
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(AT_A_TIME) -m large
 
 # make bench [ARGS="--minutes 5 --max-pairs 200000"]: beside COLMAP and GTSAM, and the node under load; docs/results/
 bench: setup

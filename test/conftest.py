@@ -45,7 +45,8 @@ os.environ["MPLBACKEND"] = "Agg"
 settings.register_profile("rotavg", deadline=None, max_examples=30)
 settings.load_profile("rotavg")
 
-torch.set_num_threads(min(MAX_THREADS, os.cpu_count() or 1))
+# Threads of several workers would wait for each other's cores, and torch's do so by spinning.
+torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else min(MAX_THREADS, os.cpu_count() or 1))
 
 
 @pytest.fixture
