@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros.solver.slam.poses.search.motions import Motions
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 
+from .test_even_shifts import of_camera
 from .test_joins import LENGTH, Streets, in_a_town, placed_by_false
 
 TURNED_DEG = 25.0
@@ -64,3 +67,23 @@ def test_motions_do_not_depend_on_the_end_that_edges_are_stated_from(streets: St
     np.testing.assert_allclose(np.abs((one.turn * two.turn).sum(axis=0)), 1.0, atol=1e-7)
     np.testing.assert_allclose(one.to - one.at, two.to - two.at, atol=1e-3)
     np.testing.assert_array_equal(one.agree(1, 2), two.agree(1, 2))
+
+
+@pytest.mark.parametrize("tilted", [False, True])
+def test_motions_do_not_depend_on_the_bodys_axes(streets: Streets, tilted: bool) -> None:
+    """Nor on whether the robots stay in a plane: where one rolls a little at each step, all three axes are judged."""
+    here = streets
+    if tilted:
+        rolls = np.radians(np.random.default_rng(0).normal(0, 0.3, len(streets.joins)))
+        wobble = Rotation.from_rotvec(np.outer(rolls, [1, 0, 0]))
+        turned = wobble * Rotation.from_quat(streets.graph.target_from_source.numpy())
+        here = streets._replace(graph=replace(streets.graph, target_from_source=torch.from_numpy(turned.as_quat())))
+    poses = [placed_by_false(each).pose for each in (here, here._replace(graph=of_camera(here.graph)))]
+    assert all(pose.problem.turns == (3 if tilted else 1) for pose in poses)
+    one, two = (Motions.of(pose, joins_of(pose, here)[0]) for pose in poses)
+    turns = [2 * np.arccos(np.minimum(np.abs(each.turn[3]), 1.0)) for each in (one, two)]
+    np.testing.assert_allclose(*turns, atol=1e-3)
+    lengths = [np.linalg.norm(each.to - each.at, axis=1) for each in (one, two)]
+    np.testing.assert_allclose(*lengths, atol=0.02)
+    agree = [each.agree(pose.problem.turns, pose.problem.shifts) for each, pose in zip((one, two), poses, strict=True)]
+    np.testing.assert_array_equal(*agree)

@@ -29,6 +29,9 @@ from rotavg_ros.solver.slam.posterior.moves.turning import sides_turned, trusted
 _WRONG = 0.5
 # Maximum number of rounds; of joins that are tried in each, those of most runs first; and of closures compared.
 _MAX_ROUNDS, _MAX_JOINS, _MAX_COMPARED = 8, 8, 1000
+# A group is not tried if another one of the same two chains has more than twice its runs: among many random joins some
+# agree by chance.
+_LEAST_SHARE = 0.5
 
 
 class Join(NamedTuple):
@@ -94,7 +97,8 @@ def other_joins(pose: PoseMode) -> list[Join]:
     """Groups of closures that would place a chain otherwise than it lies, those of most runs first.
 
     What joins the two chains otherwise may be wrong where it is of fewest runs, or at either chain, so a group may be
-    there several times; not where it has fewer runs than the closures that would have to be wrong.
+    there several times; not where it has fewer runs than the closures that would have to be wrong, or than half of
+    those of another group.
     """
     problem, places, told = pose.problem, pose.solved.places, pose.problem.told
     closure, drawn = problem.mode.problem.closure, problem.drawn
@@ -110,6 +114,7 @@ def other_joins(pose: PoseMode) -> list[Join]:
     believing = joins[places.right[joins] > _WRONG]
     cuts, component = ChainCuts.of(len(names), ends[believing], told.run[believing]), connected(len(names), ends)
     alone = np.eye(len(names), dtype=bool)
+    most: dict[tuple[int, int], int] = {}
     found: list[Join] = []
     is_left = np.ones(len(could), dtype=bool)
     while is_left.any() and len(found) < _MAX_JOINS:
@@ -118,13 +123,16 @@ def other_joins(pose: PoseMode) -> list[Join]:
         seed = with_most_runs(alike & is_left & is_left[:, None], told.run[could])
         members = alike[seed] & is_left
         is_left &= ~members
-        believed, before, (first, second) = could[members], len(found), pair[seed]
+        believed, before, (first, second) = could[members], len(found), pair[seed].tolist()
+        runs = len(np.unique(told.run[believed]))
+        if runs < _LEAST_SHARE * most.setdefault((first, second), runs):
+            is_left &= (pair != pair[seed]).any(axis=1)  # groups of most runs come first
+            continue
         is_near = component == component[first]
         for beyond in (*cuts.beyond(first, second), ~alone[first], alone[second]):
             crossing = joins[beyond[ends[joins, 0]] != beyond[ends[joins, 1]]]
             doubted = np.setdiff1d(crossing, believed)
-            contradicted = doubted[places.right[doubted] > _WRONG]
-            is_enough = len(np.unique(told.run[believed])) >= len(np.unique(told.run[contradicted]))
+            is_enough = runs >= len(np.unique(told.run[doubted[places.right[doubted] > _WRONG]]))
             if is_enough and not any(np.array_equal(doubted, other.doubted) for other in found[before:]):
                 moving, resting = (beyond & is_near)[number], (~beyond & is_near)[number]
                 found.append(Join(believed, doubted, moving, resting, motions.turn[:, [seed]]))

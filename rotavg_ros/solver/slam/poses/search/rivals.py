@@ -21,8 +21,8 @@ from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
 
-# Maximum number of rival labellings compared by their translations; and largest distance, nats, by rotations alone from
-# the likeliest labelling, or the likeliest without slips.
+# Maximum number of rival labellings compared by their translations, and of those published; and largest distance, nats,
+# by rotations alone from the likeliest labelling, or the likeliest without slips.
 _MAX_RIVALS, _FARTHEST = 8, 20.0
 # Maximum number of labellings in which whole runs are believed or doubted.
 _MAX_ASKED = 3
@@ -70,7 +70,7 @@ def rival_poses(
     ended.extend(_with_other_runs(_distinct(ended, HOPELESS)[:_MAX_ASKED]))
     ended.append(begun_at_runs(min(ended, key=lambda rival: rival.cost)))
     ended.extend(_jumping(min(ended, key=lambda rival: rival.cost)))
-    rivals = _distinct(ended, NEAR)
+    rivals = _distinct(ended, NEAR)[:_MAX_RIVALS]
     cost = np.array([rival.cost for rival in rivals])
     share = np.exp(cost[0] - cost)
     poses: list[PoseMode] = []
