@@ -12,6 +12,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.minimum_cut import FlowNetwork
 
 
@@ -28,6 +29,36 @@ def connected(count: int, ends: np.ndarray) -> np.ndarray:
     """``(n,)`` number of the connected component of each of n = ``count`` chains; closures join ``(B, 2)``."""
     links = coo_array((np.ones(len(ends)), ends.T), shape=(count, count))
     return np.asarray(connected_components(links, directed=False)[1])
+
+
+def joined_by_others(count: int, ends: np.ndarray) -> np.ndarray:
+    """``(B,)`` bool, for each of B closures whether others of them join the chains ``(B, 2)`` that it joins, too."""
+    pairs, which, number = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return np.asarray(((number > 1) | _on_cycles(count, pairs))[which])
+
+
+@compiled
+def _on_cycles(count: int, pairs: np.ndarray) -> np.ndarray:
+    """``(P,)`` bool, whether the ends of each of P distinct pairs ``(P, 2)`` are connected by the others."""
+    found = np.zeros(len(pairs), np.bool_)
+    leads = np.empty(count, np.int64)
+    for asked in range(len(pairs)):
+        for chain in range(count):
+            leads[chain] = chain
+        for pair in range(len(pairs)):
+            if pair != asked:
+                leads[_root(leads, pairs[pair, 0])] = _root(leads, pairs[pair, 1])
+        found[asked] = _root(leads, pairs[asked, 0]) == _root(leads, pairs[asked, 1])
+    return found
+
+
+@compiled
+def _root(leads: np.ndarray, chain: int) -> int:
+    """The chain that represents all that are connected with this one; ways to it are halved."""
+    while leads[chain] != chain:
+        leads[chain] = leads[leads[chain]]
+        chain = leads[chain]
+    return chain
 
 
 @dataclass(frozen=True)

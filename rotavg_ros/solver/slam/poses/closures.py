@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rotavg_ros.solver.algebra.small_matrices import eigh, inverse_root
 from rotavg_ros.solver.running.cached import cached_property
+from rotavg_ros.solver.slam.graph.chain_cuts import connected, joined_by_others
 from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.noise.repeats import Near, places_near
 from rotavg_ros.solver.slam.poses.even.shifts import EvenShifts
@@ -40,32 +41,59 @@ class Predictions:
     Attributes:
         mean: ``(C, k + m)`` μ, rad and metres.
         covariance: ``(C, k + m, k + m)`` P.
+        of_wrong: those of wrong closures, if they are others (:meth:`bounded`).
     """
 
     mean: np.ndarray
     covariance: np.ndarray
+    of_wrong: Predictions | None = None
+
+    @property
+    def wrong(self) -> Predictions:
+        """The predictions by which wrong closures are judged."""
+        return self if self.of_wrong is None else self.of_wrong
 
     def turn(self, uneven: np.ndarray) -> np.ndarray:
         """``(C, k)`` rad, mean turns, given the maps ``(C, k, k)`` from even turns."""
         return np.asarray(np.matmul(uneven, self.mean[:, : uneven.shape[1], None])[:, :, 0])
 
-    def within(self, turns: int, turn: float, shift: np.ndarray) -> Predictions:
+    def bounded(self, turns: int, turn: float, shift: np.ndarray, within_chain: np.ndarray) -> Predictions:
         """The predictions combined with the prior bounds on turns and shifts.
 
         If a closure alone joins two robots, nothing else predicts it, and the density of a good one would vanish.
+
+        Wrong closures are judged without what is unknown of where chains of odometry lie as wholes. All between two
+        chains share that error: it says nothing of whether they agree; and integrated for each of them alone, it would
+        make any number of them fit a chain whose place is unknown.
 
         Args:
             turns: k.
             turn: prior variance per component, rad², about the closure's own value.
             shift: ``(C,)`` m², likewise.
+            within_chain: ``(C,)`` bool, closures whose ends odometry joins.
         """
         spread = np.diagonal(self.covariance, axis1=1, axis2=2)
         # V / (p + V), separately for turns and for shifts, so that absurd values of one do not affect the other.
         share = np.empty_like(self.mean)
         share[:, :turns] = (turn / (spread[:, :turns].mean(axis=1) + turn))[:, None]
         share[:, turns:] = (shift / (spread[:, turns:].mean(axis=1) + shift))[:, None]
-        root = np.sqrt(share)
-        return Predictions(share * self.mean, root[:, :, None] * self.covariance * root[:, None, :])
+        bounded = Predictions(share * self.mean, _scaled(self.covariance, share))
+        return replace(bounded, of_wrong=self._of_parts(bounded, turns, within_chain, share.min(axis=1) > _TOLD))
+
+    def _of_parts(self, bounded: Predictions, turns: int, within: np.ndarray, is_told: np.ndarray) -> Predictions:
+        """The predictions with parts of all chains as uncertain as of those that closures ``within`` chains tell of.
+
+        What nothing predicts, because its prior bound is smaller, is as ``bounded``.
+        """
+        if within.all() or not within.any():
+            return bounded
+        spread = np.diagonal(self.covariance, axis1=1, axis2=2)
+        share = np.empty_like(spread)
+        for part in (slice(turns), slice(turns, None)):
+            variance = spread[:, part].mean(axis=1)
+            share[:, part] = np.minimum(variance[within].max() / variance, 1.0)[:, None]
+        covariance = np.where(is_told[:, None, None], _scaled(self.covariance, share), bounded.covariance)
+        return Predictions(np.where(is_told[:, None], self.mean, bounded.mean), covariance)
 
     def square_length(self, stated: np.ndarray, own: np.ndarray) -> np.ndarray:
         """``(C,)`` m², expected squared lengths of closures, given what each states and the predictions by all else.
@@ -113,6 +141,12 @@ class Predictions:
         return np.asarray((turn < _TOLD * ANYHOW) & (shift < _TOLD * extent))
 
 
+def _scaled(covariance: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """``(C, d, d)`` covariances with variances times ``share`` ``(C, d)`` and the same correlations."""
+    root = np.sqrt(share)
+    return np.asarray(root[:, :, None] * covariance * root[:, None, :])
+
+
 @dataclass(frozen=True)
 class Told:
     """What rotations alone say of C closures.
@@ -125,6 +159,7 @@ class Told:
             have the prediction's variance added. For a labelled closure, only what that adds to the log density.
         is_known: ``(C,)`` bool, whether a translation is stated.
         label: ``(C,)`` +1 if the closure is labelled accepted, −1 if rejected, else 0.
+        chains: ``(C, 2)`` numbers of the chains of odometry at its ends.
         run: ``(C,)`` number of the closure's run.
         follows: ``(C,)`` the closure before each, or -1.
         sign: ``(C,)`` +1 where the closure runs from its older to its newer end, else −1.
@@ -136,11 +171,24 @@ class Told:
     false_odds: np.ndarray
     is_known: np.ndarray
     label: np.ndarray
+    chains: np.ndarray
     run: np.ndarray
     follows: np.ndarray
     sign: np.ndarray
     detection: np.ndarray
     detected: np.ndarray
+
+    def joined(self, is_right: np.ndarray) -> np.ndarray:
+        """``(C,)`` bool, closures whose ends odometry and other ones that are right ``(C,)`` join."""
+        first, second = self.chains.T
+        is_join = np.asarray(first != second)
+        if not is_join.any():
+            return ~is_join
+        count, right = int(self.chains.max()) + 1, np.flatnonzero(is_join & is_right)
+        component = connected(count, self.chains[right])
+        joined = np.asarray(component[first] == component[second])
+        joined[right] = joined_by_others(count, self.chains[right])
+        return joined
 
     def detected_near(self, rows: np.ndarray, tells: np.ndarray, *, in_order: bool) -> Near:
         """For some closures, those of the others detected shortly before or after them, never themselves.
@@ -238,6 +286,11 @@ class Scale:
     def closure(self) -> float:
         """Variance of a typical good closure."""
         return float(np.median(self.good)) if len(self.good) else self.extent
+
+    @cached_property
+    def own_closure(self) -> float:
+        """The part of it that closures of a run do not share."""
+        return float(np.median(self.own)) if len(self.own) else self.extent
 
 
 @dataclass(frozen=True)

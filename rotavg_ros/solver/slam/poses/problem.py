@@ -47,6 +47,9 @@ class PoseProblem:
         priors: of translations.
         jump: ``(M,)`` m² per component, variance of the jump of each edge of odometry; 0 where there is none. None:
             nowhere.
+        extent: m² per component, variance of the distance between two places of the map, for labellings that are
+            compared: how many pairs of places a front end may confuse does not depend on where one puts them. None: of
+            the places as they are.
     """
 
     graph: ViewGraph
@@ -54,6 +57,7 @@ class PoseProblem:
     mode: Mode
     priors: PlacePriors = field(default_factory=PlacePriors)
     jump: np.ndarray | None = None
+    extent: float | None = None
 
     @cached_property
     def drawn(self) -> ClosureGraph:
@@ -230,10 +234,16 @@ class PoseProblem:
         return np.asarray(self.drawn.view_graph_edge[self.mode.problem.closure - self.drawn.num_segments])
 
     @cached_property
+    def chains(self) -> np.ndarray:
+        """``(C, 2)`` numbers, from 0, of the chains of odometry at closures' ends."""
+        drawn, closure = self.drawn, self.mode.problem.closure
+        number = np.unique(drawn.chain, return_inverse=True)[1]
+        return np.asarray(number[np.stack((drawn.source[closure], drawn.target[closure]), axis=1)])
+
+    @cached_property
     def within_chain(self) -> np.ndarray:
         """``(C,)`` bool, closures whose ends odometry joins."""
-        drawn, closure = self.drawn, self.mode.problem.closure
-        return np.asarray(drawn.chain[drawn.source[closure]] == drawn.chain[drawn.target[closure]])
+        return np.asarray(self.chains[:, 0] == self.chains[:, 1])
 
     @cached_property
     def stated_square(self) -> np.ndarray:
@@ -260,7 +270,8 @@ class PoseProblem:
         own = self.own[closure] / state.others.relative[closure]
         order = problem.detection, problem.detected
         uneven = self.even_turns.uneven[closure]
-        return Told(own, uneven, false_odds, is_known, label, problem.run, problem.follows, problem.sign, *order)
+        of_runs = problem.run, problem.follows, problem.sign
+        return Told(own, uneven, false_odds, is_known, label, self.chains, *of_runs, *order)
 
     @cached_property
     def equations(self) -> BlockEquations:

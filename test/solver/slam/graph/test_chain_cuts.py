@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rotavg_ros.solver.slam.graph.chain_cuts import ChainCuts, with_most_runs
+from rotavg_ros.solver.slam.graph.chain_cuts import ChainCuts, connected, joined_by_others, with_most_runs
 
 
 @given(st.integers(2, 6), st.integers(0, 14), st.integers(0, 2**32 - 1))
@@ -31,6 +31,17 @@ def test_a_cut_is_of_fewest_runs_and_as_near_as_there_is_one(count: int, joins: 
         assert is_beyond[second] and not is_beyond[first]
         assert runs_across(is_beyond) == fewest
     assert near_first.sum() == max(sizes) and near_second.sum() == min(sizes)
+
+
+@given(st.integers(2, 7), st.integers(0, 14), st.integers(0, 2**32 - 1))
+def test_what_others_join_is_still_connected_without_it(count: int, joins: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ends = np.array([rng.permutation(count)[:2] for _ in range(joins)], dtype=np.int64).reshape(-1, 2)
+    joined = joined_by_others(count, ends)
+    assert len(joined) == joins
+    for one, (first, second) in enumerate(ends):
+        component = connected(count, np.delete(ends, one, axis=0))
+        assert joined[one] == (component[first] == component[second])
 
 
 def test_runs_count_before_closures() -> None:

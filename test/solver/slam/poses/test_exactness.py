@@ -111,7 +111,7 @@ def test_repeats_anywhere_are_there_or_back_by_turn_and_shift(in_order: bool) ->
     # There, back by the inverse, and as far off, but turned otherwise.
     turn[1:4], shift[1:4] = np.outer([1, -1, -1], turn[0]), np.outer([1, -1, 1], shift[0])
     of_turn, of_shift = np.full(count, 0.01**2), np.full(count, 0.02**2)
-    errors = Errors(turn, shift, of_turn, of_shift, np.ones(count, dtype=bool))
+    errors = Errors(turn, shift, of_turn, of_shift, of_shift / 2, np.ones(count, dtype=bool))
     wrong, everybody = rng.random(count), np.arange(count)
     is_one = None if in_order else np.ones(count, dtype=bool)
     near = Near(everybody, everybody, places_near(everybody, everybody, is_one, count))

@@ -151,7 +151,7 @@ def test_a_fleet_is_placed_though_each_pair_has_more_false_joins_than_good_ones(
     assert position_errors(solution.position.numpy(), streets.position).mean() < 0.5
 
 
-@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.large) for seed in (0, 2, 4))])
+@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.large) for seed in (0, 1, 2, 4))])
 def test_one_join_against_another_is_undecided(seed: int) -> None:
     """Their rotations agree, so that only places differ: nobody can know which one is false."""
     streets = in_a_town(seed, good=1, false=1)

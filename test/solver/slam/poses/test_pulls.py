@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from rotavg_ros.solver.slam.poses.closures import GOOD, Predictions, Scale, Told
+from rotavg_ros.solver.slam.poses.closures import ANYHOW, GOOD, Predictions, Scale, Told
 from rotavg_ros.solver.slam.poses.even.shifts import EvenShifts
 from rotavg_ros.solver.slam.poses.places.classes import CLASSES, Said
 from rotavg_ros.solver.slam.poses.places.pulls import pulled
@@ -24,6 +24,7 @@ def told(count: int) -> Told:
         false_odds=np.zeros(count),
         is_known=np.ones(count, dtype=bool),
         label=np.zeros(count),
+        chains=np.zeros((count, 2), dtype=np.int64),
         run=np.zeros(count, dtype=np.int64),
         follows=each - 1,
         sign=np.ones(count),
@@ -43,7 +44,7 @@ def said_of(count: int, off: float) -> Said:
     mean = np.tile([0.0, off, 0.0], (count, 1))
     covariance = np.tile(np.diag([1e-4, 1.0, 1.0]), (count, 1, 1))
     scale = alike(count, variance=0.01, extent=2500.0)
-    return Said.of(Predictions(mean, covariance), told(count), 1, scale, PlacePriors())
+    return Said.of(Predictions(mean, covariance), told(count), np.ones(count, dtype=bool), 1, scale, PlacePriors())
 
 
 def of_class(number: int, count: int) -> np.ndarray:
@@ -88,13 +89,48 @@ def test_densities_given_the_turn_are_those_of_both_together() -> None:
     covariance = said.predictions.covariance.copy()
     covariance[:, 0, 1] = covariance[:, 1, 0] = 0.006
     mean = np.array([[0.01, 0.2, -0.1]])
-    said = Said.of(Predictions(mean, covariance), told(1), 1, said.scale, PlacePriors())
+    said = Said.of(Predictions(mean, covariance), told(1), np.ones(1, dtype=bool), 1, said.scale, PlacePriors())
     good = covariance[0] + np.diag([1e-4, 0.01, 0.01])
     both = multivariate_normal(np.zeros(3), good).logpdf(mean[0])
     np.testing.assert_allclose((said.log_turn + said.log_shift)[0, 0], both)
     tail = covariance[0] + np.diag([1e-4, 0.16, 0.16])
     both = multivariate_normal(np.zeros(3), tail).logpdf(mean[0])
     np.testing.assert_allclose((said.log_turn + said.log_shift)[GOOD - 1, 0], both)
+
+
+def test_places_anywhere_are_as_likely_wherever_the_map_has_them() -> None:
+    """As likely as by a normal density about any place in the mean, which SciPy's entropy is."""
+    near, far = (said_of(3, off).log_anywhere for off in (0.5, 40.0))
+    np.testing.assert_array_equal(near, far)
+    np.testing.assert_allclose(near, -multivariate_normal(np.zeros(2), 2500.0 * np.eye(2)).entropy())
+
+
+def test_a_false_rotation_is_not_in_place_where_no_place_is_known() -> None:
+    """A hundred closures of a robot that nothing else joins cannot all be in place: there is but one for the robot."""
+    known, scale = said_of(1, 0.0), alike(1, variance=0.01, extent=2500.0)
+    assert known.log_in_place[0] > known.log_anywhere[0] + 5
+    loose = Predictions(np.zeros((1, 3)), np.diag([3.0, 2000.0, 2000.0])[None])
+    joined = np.ones(1, dtype=bool)
+    assert Said.of(loose, told(1), joined, 1, scale, PlacePriors()).log_in_place[0] == -np.inf
+    # Nor where only wrong ones would tell of a place.
+    assert Said.of(known.predictions, told(1), ~joined, 1, scale, PlacePriors()).log_in_place[0] == -np.inf
+
+
+def test_wrong_closures_are_judged_without_what_two_chains_share() -> None:
+    """Two within chains, known to .1 m; one between two, by what is known to 5 m; and one that nothing else joins."""
+    deviation = np.array([[0.01, 0.1, 0.1], [0.01, 0.1, 0.1], [0.2, 5.0, 5.0], [100.0, 1e4, 1e4]])
+    mean = np.array([[0.0, 0.1, 0.1], [0.0, 0.1, 0.1], [0.5, 8.0, 1.0], [1.0, 300.0, 1.0]])
+    within = np.array([True, True, False, False])
+    all_else = Predictions(mean, deviation[:, :, None] ** 2 * np.eye(3))
+    bounded = all_else.bounded(1, ANYHOW, np.full(4, 2500.0), within)
+    spread = np.sqrt(np.diagonal(bounded.wrong.covariance, axis1=1, axis2=2))
+    np.testing.assert_allclose(spread[2], [0.01, 0.1, 0.1])
+    np.testing.assert_allclose(bounded.wrong.mean[2], mean[2])  # not drawn towards what it says itself
+    np.testing.assert_allclose(spread[3], [np.sqrt(ANYHOW), 50.0, 50.0], rtol=1e-3)
+    # Right ones pay for what is unknown of the place.
+    assert np.sqrt(bounded.covariance[2, 1, 1]) > 4.9
+    alone = all_else.bounded(1, ANYHOW, np.full(4, 2500.0), np.ones(4, dtype=bool))
+    np.testing.assert_array_equal(alone.wrong.covariance, alone.covariance)
 
 
 def test_what_states_no_translation_does_not_pull() -> None:

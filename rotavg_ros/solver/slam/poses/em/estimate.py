@@ -144,12 +144,13 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     # Variance of a closure's shift if neither the place of its source nor its orientation is known.
     anywhere = _extent(problem, state) + problem.stated_square
     spend(_ROW * len(rows))
-    predictions = _left_out(factor, root, left, closure).within(problem.turns, ANYHOW, anywhere)
+    predictions = _left_out(factor, root, left, closure)
+    predictions = predictions.bounded(problem.turns, ANYHOW, anywhere, problem.within_chain)
     scale = _expected_scale(problem, state, predictions, way)
     judge = replace(judge, told=replace(judge.told, rotation_variance=turned[closure, 0]))
     spend(_ROW * len(rows))
     closure_covariance = stated_covariance(problem, state.noise, scale.shape)
-    maps = MapTurns.of(problem, state.position, predictions, closure_covariance)
+    maps = MapTurns.of(problem, state.position, predictions.wrong, closure_covariance, state.noise.common)
     spend(_ROW * len(rows))
     judged = judge(predictions, maps, places.chance, scale)
     return Solved(
@@ -215,6 +216,8 @@ def _nothing_known(problem: PoseProblem, state: PoseState, judge: Judge) -> Plac
 
 def _extent(problem: PoseProblem, state: PoseState) -> float:
     """m² per component, variance of the distance between two places of the map."""
+    if problem.extent is not None:
+        return problem.extent
     spread = float(np.var(state.position @ problem.bases[1], axis=0).mean())
     return 2 * spread + (_LEAST_EXTENT * problem.typical) ** 2
 

@@ -30,7 +30,7 @@ class Said:
     """Densities of C closures in each of J classes of translations, given the predictions by all else.
 
     Attributes:
-        predictions: predicted turns and shifts, independent of the class.
+        predictions: predicted turns and shifts, as good closures are judged.
         turns: k.
         scale: scales of errors.
         turned: ``(2, C)`` rad² per component, variances of turns of good ones and of wrong places seen nearly alike.
@@ -40,6 +40,7 @@ class Said:
             good closures of even shifts.
         axes: ``(C, m, m)`` those axes of even shifts, in columns.
         anywhere: ``(C, m)`` metres and m² of shifts, marginal over turns, likewise.
+        is_told: ``(C,)`` bool, whether anything that may be right predicts them.
     """
 
     predictions: Predictions
@@ -52,21 +53,34 @@ class Said:
     spread: np.ndarray
     axes: np.ndarray
     anywhere: tuple[np.ndarray, np.ndarray]
+    is_told: np.ndarray
 
     @classmethod
-    def of(cls, predictions: Predictions, told: Told, turns: int, scale: Scale, priors: PlacePriors) -> Said:
-        """Under one choice of noise."""
+    def of(
+        cls, predictions: Predictions, told: Told, is_joined: np.ndarray, turns: int, scale: Scale, priors: PlacePriors
+    ) -> Said:
+        """Under one choice of noise.
+
+        Args:
+            predictions: by all else.
+            told: results of rotations alone.
+            is_joined: ``(C,)`` bool, whether right closures join the chains at each one's ends. What wrong ones say of
+                a chain's place tells nothing of each other: the errors of two would be opposite for that alone.
+            turns: k.
+            scale: scales of errors.
+            priors: prior parameters of places.
+        """
         turned = np.stack((told.rotation_variance, told.rotation_variance + np.radians(priors.turned_deg) ** 2))
         here = given_turn(predictions.even(scale.shape.even), turned[0], turns)
-        elsewhere = given_turn(predictions, turned[1], turns)
+        elsewhere = given_turn(predictions.wrong, turned[1], turns)
         spread = np.stack([here.spread] * GOOD + [elsewhere.spread] * ELSEWHERE)
         along = np.stack([here.along] * GOOD + [elsewhere.along] * ELSEWHERE)
         # A repeat has the turn and shift of the closure that it repeats, which is seen nearly at the right angle.
         repeats = -np.maximum(elsewhere.square - _FARTHEST**2, 0.0) / 2
         log_turn = np.stack([here.log_turn] * GOOD + [elsewhere.log_turn] * WRONG + [repeats])
         variance = _variances(scale, priors)
-        anywhere = along_axes(predictions, turns)
-        return cls(predictions, turns, scale, turned, variance, log_turn, along, spread, here.axes, anywhere)
+        anywhere, is_told = along_axes(predictions.wrong, turns), predictions.tell(turns, scale.extent) & is_joined
+        return cls(predictions, turns, scale, turned, variance, log_turn, along, spread, here.axes, anywhere, is_told)
 
     @cached_property
     def total(self) -> np.ndarray:
@@ -81,15 +95,22 @@ class Said:
 
     @cached_property
     def log_anywhere(self) -> np.ndarray:
-        """``(C,)`` nats, log densities of shifts that lead anywhere on the map."""
-        along, spread = self.anywhere
-        return log_normal(along, spread + self.scale.anywhere[:, None])
+        """``(C,)`` nats, log densities of shifts that lead anywhere on the map, wherever its parts lie.
+
+        That is a normal density in the mean over its own values. Itself it would draw chains of odometry together
+        that false closures join at random, since all of them are shorter then.
+        """
+        shifts = self.anywhere[0].shape[1]
+        return np.asarray(-(np.log(2 * np.pi * self.scale.anywhere) + 1) * shifts / 2)
 
     @cached_property
     def log_in_place(self) -> np.ndarray:
-        """``(C,)`` nats, log densities of shifts at the right place, marginal over turns."""
+        """``(C,)`` nats, log densities of shifts at the right place, marginal over turns.
+
+        Infinitely low if nothing tells of that place: of many such closures hardly any are there, wherever it is.
+        """
         along, spread = self.anywhere
-        return log_normal(along, spread + self.scale.own[:, None])
+        return np.where(self.is_told, log_normal(along, spread + self.scale.own[:, None]), -np.inf)
 
     def errors(self) -> tuple[np.ndarray, np.ndarray]:
         """``(J + 1, C)`` metres and m² per component: length of ε's mean, and its variance.

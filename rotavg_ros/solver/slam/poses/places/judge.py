@@ -36,6 +36,8 @@ _LOG_NOTHING = -1e6
 _LEAST_CHANCE, _SHARE = 1e-9, 0.01
 # Closures that are good, or false, with a lower probability are not compared with others.
 _UNLIKELY = 1e-3
+# Chains are joined by closures that are right with a higher probability.
+_RIGHT = 0.5
 # Units of work per closure, for each part of the judgement.
 _CLOSURE = 0.007
 
@@ -71,7 +73,8 @@ class Judge:
             in_order: given only the closures before, so that densities multiply to the joint one; else all others.
         """
         told, known = self.told, self.told.is_known
-        said = Said.of(predictions, told, self.turns, scale, self.priors)
+        is_joined = told.joined(before[:GOOD].sum(axis=0) > _RIGHT)
+        said = Said.of(predictions, told, is_joined, self.turns, scale, self.priors)
         spend(_CLOSURE * len(known))
         log_class = said.log_turn + said.log_shift
         alone = log_sum(log_class[BY_ITSELF]) - np.log(WRONG)
@@ -103,12 +106,12 @@ class Judge:
     def _repeats(
         self, said: Said, maps: MapTurns, before: np.ndarray, log_alone: np.ndarray, *, in_order: bool
     ) -> Repeats:
-        told, scale, predictions = self.told, said.scale, said.predictions
+        told, scale, predictions = self.told, said.scale, said.predictions.wrong
         turn, shift = (
             told.sign[:, None] * each for each in (predictions.turn(told.uneven), predictions.mean[:, self.turns :])
         )
-        tells = predictions.tell(self.turns, scale.extent)
-        errors = Errors(turn, shift, told.rotation_variance, np.full(len(turn), scale.closure), tells)
+        shift_variance, own_variance = (np.full(len(turn), each) for each in (scale.closure, scale.own_closure))
+        errors = Errors(turn, shift, told.rotation_variance, shift_variance, own_variance, said.is_told)
         alone = np.exp(log_alone) * self._could_be(before[:-1].sum(axis=0), 1)
         return repeats_of(errors, maps, before, told, alone, in_order=in_order)
 
@@ -145,8 +148,9 @@ class Judge:
         priors, told = self.priors, self.told
         log_wrong = said.log_anywhere + np.log1p(-priors.turned_in_place)
         log_right = said.log_in_place + np.log(priors.turned_in_place)
-        by_itself, wrong = np.logaddexp(log_wrong, log_right), before[-1] * expit(log_wrong - log_right)
-        could_be = self._could_be(before[-1], 0)
+        by_itself = np.logaddexp(log_wrong, log_right)
+        wrong = before[-1] * expit(log_wrong - log_right) * said.is_told
+        could_be = self._could_be(before[-1], 0) & said.is_told
         has_turned, turned = maps.repeats(wrong, by_itself, told, could_be, in_order=in_turn.by_those_before)
         spend(_CLOSURE * len(repeats.turned))
         # The same wrong places as before, or as all that are off by the same turn of the map.
@@ -161,7 +165,7 @@ class Judge:
         log_nobodys, log_elsewhere = self._log_elsewhere(anywhere, by_itself, wrong, in_turn)
         elsewhere = np.logaddexp(by_itself + log_nobodys, log_elsewhere)
         behind = log_alone + np.log(priors.from_behind) + said.log_anywhere
-        log_behind = log_from_behind(said.predictions, told.uneven, said.turned[1])
+        log_behind = log_from_behind(said.predictions.wrong, told.uneven, said.turned[1])
         return np.logaddexp(log_alone + elsewhere, log_repeat), log_behind + np.logaddexp(behind, log_repeat)
 
     def _could_be(self, chance: np.ndarray, label: int) -> np.ndarray:

@@ -34,6 +34,7 @@ class Errors(NamedTuple):
         turn, shift: ``(C, k)`` rad and ``(C, m)`` metres.
         turn_variance: ``(C,)`` rad² per component, of a good closure.
         shift_variance: ``(C,)`` m² per component, of a good closure.
+        own_variance: ``(C,)`` m², the part of it that closures of a run do not share.
         is_told: ``(C,)`` bool, whether all else predicts it; if not, its error is unknown.
     """
 
@@ -41,6 +42,7 @@ class Errors(NamedTuple):
     shift: np.ndarray
     turn_variance: np.ndarray
     shift_variance: np.ndarray
+    own_variance: np.ndarray
     is_told: np.ndarray
 
 

@@ -28,7 +28,7 @@ class MapTurns:
         shift: ``(C, 3)`` metres by which the turned map moves the newer end from its place.
         place: ``(C, 3)`` metres, place of the newer end.
         covariance: ``(C, k + m, k + m)`` of turns and shifts, including the closures' own noise.
-        own: ``(C, k + m, k + m)`` of that noise alone.
+        own: ``(C, k + m, k + m)`` of that noise alone, without what closures of a run share.
         bases: ``(3, k)`` axes of turns and ``(3, m)`` of shifts.
     """
 
@@ -41,7 +41,12 @@ class MapTurns:
 
     @classmethod
     def of(
-        cls, problem: PoseProblem, position: np.ndarray, predictions: Predictions, closure_covariance: np.ndarray
+        cls,
+        problem: PoseProblem,
+        position: np.ndarray,
+        predictions: Predictions,
+        closure_covariance: np.ndarray,
+        common: float,
     ) -> MapTurns:
         """From the deviations of closures from the predictions by all else.
 
@@ -50,6 +55,7 @@ class MapTurns:
             position: ``(K, 3)`` metres, of the key nodes.
             predictions: of closures by all else.
             closure_covariance: ``(C, m, m)`` m², of good closures' shifts.
+            common: m² per component, the part of it that closures of a run share.
         """
         closure, (turns, shifts), drawn = problem.mode.problem.closure, problem.bases, problem.drawn
         k, m = turns.shape[1], shifts.shape[1]
@@ -68,13 +74,15 @@ class MapTurns:
         noise = np.zeros_like(change)
         noise[:, :k, :k] = problem.told.rotation_variance[:, None, None] * np.eye(k)
         noise[:, k:, k:] = closure_covariance
+        own = noise.copy()
+        own[:, k:, k:] -= common * np.eye(m)
         back_turned = change.transpose(0, 2, 1)
         return cls(
             turn,
             shift,
             position[np.where(is_forward, drawn.target[closure], drawn.source[closure])],
             change @ (predictions.covariance + noise) @ back_turned,
-            change @ noise @ back_turned,
+            change @ own @ back_turned,
             problem.bases,
         )
 

@@ -80,7 +80,7 @@ def repeats_of(
     linked = np.zeros(len(alike))
     linked[pairs.later] = before[REPEATS, pairs.later] * alike[pairs.earlier]
     in_turn = InTurn(told.detection, told.run, in_order)
-    kinds = (errors.turn, errors.turn_variance), (errors.shift, errors.shift_variance)
+    kinds = (errors.turn, errors.turn_variance), (errors.shift, errors.own_variance)
     of_turns, of_shifts = (_Exactness.of(off, variance, pairs, linked, in_turn) for off, variance in kinds)
     moved = [turn * shift for turn, shift in zip(of_turns.density, of_shifts.density, strict=True)]
     tells = told.detection[(alike * can_tell)[told.detection] > _LEAST_CHANCE]

@@ -101,9 +101,8 @@ def other_joins(pose: PoseMode) -> list[Join]:
     those of another group.
     """
     problem, places, told = pose.problem, pose.solved.places, pose.problem.told
-    closure, drawn = problem.mode.problem.closure, problem.drawn
-    names, number = np.unique(drawn.chain, return_inverse=True)
-    ends = number[np.stack((drawn.source[closure], drawn.target[closure]), axis=1)]
+    names, number = np.unique(problem.drawn.chain, return_inverse=True)
+    ends = problem.chains
     joins = np.flatnonzero((ends[:, 0] != ends[:, 1]) & told.is_known & (told.label == 0))
     could = joins[places.right[joins] < _WRONG]
     could = evenly(could[np.argsort(told.detected[could])], _MAX_COMPARED)

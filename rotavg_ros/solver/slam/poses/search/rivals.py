@@ -58,8 +58,11 @@ def rival_poses(
     """
     ended: list[Rival] = []
     begun: list[PoseMode] = []
+    extent: float | None = None
     for mode in _first(modes):
-        begun.append(_begun(PoseProblem(graph, translation, mode), begun))
+        begun.append(_begun(PoseProblem(graph, translation, mode, extent=extent), begun))
+        extent = begun[0].solved.scale.extent
+    begun[0] = replace(begun[0], problem=replace(begun[0].problem, extent=extent))
     for pose in begun:
         ended.append(settling(pose, min((rival.cost for rival in ended), default=np.inf)))
     # Only once, for the likeliest labelling: odometry's error is a property of the robot, not of the labels.
