@@ -50,7 +50,7 @@ def _random_graph(num_nodes: int, num_edges: int, seed: int) -> ViewGraph:
     )
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(SIZES, st.integers(1, 40), st.integers(1, 3))
 def test_both_networks_are_their_forward(size: tuple[int, int, int], tile_edges: int, threads: int) -> None:
     """In double precision, where nothing but rounding could differ, on the wildest of graphs."""
