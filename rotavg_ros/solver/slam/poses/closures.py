@@ -178,13 +178,17 @@ class Told:
     detection: np.ndarray
     detected: np.ndarray
 
+    @property
+    def is_within(self) -> np.ndarray:
+        """``(C,)`` bool, closures whose ends odometry joins."""
+        return np.asarray(self.chains[:, 0] == self.chains[:, 1])
+
     def joined(self, is_right: np.ndarray) -> np.ndarray:
         """``(C,)`` bool, closures whose ends odometry and other ones that are right ``(C,)`` join."""
         first, second = self.chains.T
-        is_join = np.asarray(first != second)
-        if not is_join.any():
-            return ~is_join
-        count, right = int(self.chains.max()) + 1, np.flatnonzero(is_join & is_right)
+        if self.is_within.all():
+            return self.is_within
+        count, right = int(self.chains.max()) + 1, np.flatnonzero(~self.is_within & is_right)
         component = connected(count, self.chains[right])
         joined = np.asarray(component[first] == component[second])
         joined[right] = joined_by_others(count, self.chains[right])

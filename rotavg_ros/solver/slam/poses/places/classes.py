@@ -41,6 +41,7 @@ class Said:
         axes: ``(C, m, m)`` those axes of even shifts, in columns.
         anywhere: ``(C, m)`` metres and m² of shifts, marginal over turns, likewise.
         is_told: ``(C,)`` bool, whether anything that may be right predicts them.
+        is_join: ``(C,)`` bool, whether they join two chains of odometry.
     """
 
     predictions: Predictions
@@ -54,6 +55,7 @@ class Said:
     axes: np.ndarray
     anywhere: tuple[np.ndarray, np.ndarray]
     is_told: np.ndarray
+    is_join: np.ndarray
 
     @classmethod
     def of(
@@ -80,7 +82,8 @@ class Said:
         log_turn = np.stack([here.log_turn] * GOOD + [elsewhere.log_turn] * WRONG + [repeats])
         variance = _variances(scale, priors)
         anywhere, is_told = along_axes(predictions.wrong, turns), predictions.tell(turns, scale.extent) & is_joined
-        return cls(predictions, turns, scale, turned, variance, log_turn, along, spread, here.axes, anywhere, is_told)
+        shifts = along, spread, here.axes, anywhere
+        return cls(predictions, turns, scale, turned, variance, log_turn, *shifts, is_told, ~told.is_within)
 
     @cached_property
     def total(self) -> np.ndarray:
@@ -95,13 +98,14 @@ class Said:
 
     @cached_property
     def log_anywhere(self) -> np.ndarray:
-        """``(C,)`` nats, log densities of shifts that lead anywhere on the map, wherever its parts lie.
+        """``(C,)`` nats, log densities of shifts that lead anywhere on the map.
 
-        That is a normal density in the mean over its own values. Itself it would draw chains of odometry together
-        that false closures join at random, since all of them are shorter then.
+        Between two chains of odometry it is the mean of a normal density over its own values, wherever they lie. Itself
+        it would draw chains together that false closures join at random, since all of these are shorter then.
         """
-        shifts = self.anywhere[0].shape[1]
-        return np.asarray(-(np.log(2 * np.pi * self.scale.anywhere) + 1) * shifts / 2)
+        (along, spread), variance = self.anywhere, self.scale.anywhere
+        wherever = -(np.log(2 * np.pi * variance) + 1) * along.shape[1] / 2
+        return np.where(self.is_join, wherever, log_normal(along, spread + variance[:, None]))
 
     @cached_property
     def log_in_place(self) -> np.ndarray:
