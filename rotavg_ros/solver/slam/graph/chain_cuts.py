@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.minimum_cut import FlowNetwork
@@ -34,31 +34,45 @@ def connected(count: int, ends: np.ndarray) -> np.ndarray:
 def joined_by_others(count: int, ends: np.ndarray) -> np.ndarray:
     """``(B,)`` bool, for each of B closures whether others of them join the chains ``(B, 2)`` that it joins, too."""
     pairs, which, number = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
-    return np.asarray(((number > 1) | _on_cycles(count, pairs))[which])
+    # One tree of all: a root besides the chains leads to one chain of each component.
+    first = np.unique(connected(count, pairs), return_index=True)[1]
+    linked = np.concatenate((pairs, np.column_stack((first, np.full_like(first, count)))))
+    links = coo_array((np.ones(len(linked)), linked.T), shape=(count + 1, count + 1)).tocsr()
+    order, above = breadth_first_order(links, count, directed=False)
+    is_on_cycle = np.ones(len(pairs), dtype=bool)
+    lower = np.where(above[pairs[:, 0]] == pairs[:, 1], pairs[:, 0], pairs[:, 1])
+    in_tree = above[lower] == pairs.sum(axis=1) - lower
+    is_on_cycle[in_tree] = _on_cycles(order, above, pairs[~in_tree])[lower[in_tree]]
+    return np.asarray(((number > 1) | is_on_cycle)[which])
 
 
 @compiled
-def _on_cycles(count: int, pairs: np.ndarray) -> np.ndarray:
-    """``(P,)`` bool, whether the ends of each of P distinct pairs ``(P, 2)`` are connected by the others."""
-    found = np.zeros(len(pairs), np.bool_)
-    leads = np.empty(count, np.int64)
-    for asked in range(len(pairs)):
-        for chain in range(count):
-            leads[chain] = chain
-        for pair in range(len(pairs)):
-            if pair != asked:
-                leads[_root(leads, pairs[pair, 0])] = _root(leads, pairs[pair, 1])
-        found[asked] = _root(leads, pairs[asked, 0]) == _root(leads, pairs[asked, 1])
+def _on_cycles(order: np.ndarray, above: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """``(n,)`` bool, whether pairs ``(P, 2)`` besides a tree close cycles through each node and the one above it.
+
+    The ways up from both ends of each pair meet; what has been on a cycle once is passed over.
+    """
+    count = len(above)
+    found, leads, depth = np.zeros(count, np.bool_), np.arange(count), np.zeros(count, np.int64)
+    for node in order[1:]:
+        depth[node] = depth[above[node]] + 1
+    for pair in range(len(pairs)):
+        one, other = _root(leads, pairs[pair, 0]), _root(leads, pairs[pair, 1])
+        while one != other:
+            if depth[one] < depth[other]:
+                one, other = other, one
+            found[one], leads[one] = True, above[one]
+            one = _root(leads, one)
     return found
 
 
 @compiled
-def _root(leads: np.ndarray, chain: int) -> int:
-    """The chain that represents all that are connected with this one; ways to it are halved."""
-    while leads[chain] != chain:
-        leads[chain] = leads[leads[chain]]
-        chain = leads[chain]
-    return chain
+def _root(leads: np.ndarray, node: int) -> int:
+    """The first node above that is not passed over; ways to it are halved."""
+    while leads[node] != node:
+        leads[node] = leads[leads[node]]
+        node = leads[node]
+    return node
 
 
 @dataclass(frozen=True)
