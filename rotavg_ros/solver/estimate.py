@@ -19,6 +19,7 @@ class Estimate:
 
     ``memory`` is what makes the profile's next solve of the same graph, grown a little, cheaper; nobody else reads it.
     ``warnings`` say why it should not be trusted, a sentence each. ``places`` are there where translations are known.
+    ``restated`` are edges ``(n,)`` that are made of others and were not judged.
     ``step_variance`` is how far a step of odometry errs, rad² per component. ``is_anew`` says that it is what a solve
     without a memory leads to.
     """
@@ -31,6 +32,7 @@ class Estimate:
     places: Places | None = None
     step_variance: float = math.nan
     is_anew: bool = True
+    restated: Tensor | None = None
 
 
 @dataclass(frozen=True)

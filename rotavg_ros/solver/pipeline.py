@@ -119,7 +119,11 @@ def solve(
         profile,
         run.networks.device,
         estimate.memory,
-        (*estimate.warnings, *stating_nothing, *warnings.mostly_flagged(graph, score, rotation_score)),
+        (
+            *estimate.warnings,
+            *stating_nothing,
+            *warnings.mostly_flagged(graph, score, rotation_score, estimate.restated),
+        ),
         None if places is None else _root_at_origin(places.position, estimate.body_from_world, job.component),
         None if places is None else places.variance.sqrt(),
         rotation_score,

@@ -61,15 +61,20 @@ _NO_ROTATION, _SOME_ROTATION, _SHARE_OF_NOTHING = 1e-9, 0.01, 0.05
 _FEW_BELIEVED, _FAR = 10, math.radians(30.0)
 
 
-def mostly_flagged(graph: ViewGraph, outlier_score: Tensor, rotation_score: Tensor | None = None) -> tuple[str, ...]:
+def mostly_flagged(
+    graph: ViewGraph, outlier_score: Tensor, rotation_score: Tensor | None = None, restated: Tensor | None = None
+) -> tuple[str, ...]:
     """Warns if more than half of the loop closures (without odometry: of the edges) are flagged, labelled ones aside.
 
     Args:
         graph: on the CPU, M edges.
         outlier_score: ``(M,)``.
         rotation_score: ``(M,)`` likewise, for the rotations alone; None: places are not judged.
+        restated: ``(n,)`` edges that were not judged, since they are made of others.
     """
     judged = ~graph.is_odometry & (graph.label == EdgeLabel.AUTOMATIC)
+    if restated is not None:
+        judged[restated] = False
     is_flagged = judged & (outlier_score > _FLAGGED)
     closures, flagged = int(judged.sum()), int(is_flagged.sum())
     if closures < _MIN_CLOSURES or 2 * flagged <= closures:

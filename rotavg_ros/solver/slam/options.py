@@ -13,6 +13,7 @@ SWITCHES: dict[str, str] = {
     "wide-tails": "odometry that errs more than the rest has sixteen times its variance or slipped",
     "near-misses": "the rotations of false closures are uniform over all rotations",
     "vertical": "false closures of a robot that stays upright are wrong by any turn, not only about the vertical",
+    "restated": "closures over a few keyframes are measurements, though they do not see odometry's errors",
     "repeats": "the errors of false closures are independent",
     "own-repeats": "false closures repeat each other's turns equally often in all runs",
     "label-runs": "closures that follow each other have independent labels",

@@ -12,7 +12,7 @@ from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, minimum_sp
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs, agreement_pairs
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract
-from rotavg_ros.solver.slam.graph.odometry_paths import odometry_ends
+from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths, odometry_ends
 from rotavg_ros.solver.slam.noise.gyro_bias import estimate_bias, without_bias
 from rotavg_ros.solver.slam.noise.model import (
     NoiseModel,
@@ -22,6 +22,7 @@ from rotavg_ros.solver.slam.noise.model import (
     judge_by_chain,
     noise_between_neighbours,
 )
+from rotavg_ros.solver.slam.noise.restated_odometry import restated_odometry
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # Cost of a closure in the forest: larger than that of any number of odometry steps.
@@ -72,15 +73,21 @@ def prepare(graph: ViewGraph) -> Prepared:
     bias = likely_bias(graph, prepared)
     if bias is None:
         return prepared
-    unbiased = prepare_as_it_is(without_bias(graph, bias))
+    unbiased = prepare_as_it_is(without_bias(graph, bias), restated=prepared.closure_graph.is_restated)
     fewer_disagree = unbiased.noise.outlier_share < prepared.noise.outlier_share - _BIAS_GAIN
     is_better = fewer_disagree and unbiased.noise.step_variance < prepared.noise.step_variance
     return unbiased if is_better else prepared
 
 
-def prepare_as_it_is(graph: ViewGraph, components: int | None = None) -> Prepared:
-    """The same without removing a bias; ``components`` of the noise: by default, those of the rotations."""
-    closure_graph, forest = contract_odometry(graph)
+def prepare_as_it_is(graph: ViewGraph, components: int | None = None, restated: np.ndarray | None = None) -> Prepared:
+    """The same without removing a bias.
+
+    Args:
+        graph: the graph.
+        components: components of the noise; default: those of the rotations.
+        restated: ``(M,)`` bool, closures that are made of odometry; default: those that the graph shows to be.
+    """
+    closure_graph, forest = contract_odometry(graph, restated)
     spend(_CLOSURE * int(closure_graph.is_closure.sum()))
     closure = closure_graph.is_closure
     squared_angle = (rotations.log(closure_graph.residual) ** 2).sum(dim=1).numpy()[closure]
@@ -98,7 +105,7 @@ def likely_bias(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:
     bias, closure_graph, forest, corrected = np.zeros(3), prepared.closure_graph, prepared.forest, graph
     for number in range(_BIAS_ROUNDS):
         if number > 0:
-            closure_graph, forest = contract_odometry(corrected)
+            closure_graph, forest = contract_odometry(corrected, prepared.closure_graph.is_restated)
         estimate = estimate_bias(corrected, forest, closure_graph, noise)
         if number == 0 and estimate.explained < _BIAS_EXPLAINED * _BIAS_GAIN:
             return None
@@ -115,11 +122,28 @@ def _may_be_biased(prepared: Prepared) -> bool:
     return bool((disagrees & is_confirmed).mean() > _BIAS_CONFIRMED * _BIAS_GAIN)
 
 
-def contract_odometry(graph: ViewGraph) -> tuple[ClosureGraph, SpanningForest]:
-    """The closure graph, and the forest along which it was contracted; rejected edges take no part."""
+def made_of_odometry(graph: ViewGraph) -> np.ndarray:
+    """``(M,)`` bool, closures that a graph as it was measured shows to be made of odometry."""
+    return restated_odometry(graph, OdometryPaths.along(graph, _along_odometry(graph)))
+
+
+def contract_odometry(graph: ViewGraph, restated: np.ndarray | None = None) -> tuple[ClosureGraph, SpanningForest]:
+    """The closure graph, and the forest along which it was contracted; rejected edges take no part.
+
+    Args:
+        graph: the graph.
+        restated: ``(M,)`` bool, closures that are made of odometry; default: :func:`made_of_odometry`, which is of a
+            graph whose systematic errors have not been removed.
+    """
     spend(_EDGE * graph.num_edges)
+    forest = _along_odometry(graph)
+    paths = OdometryPaths.along(graph, forest)
+    return contract(graph, paths, restated_odometry(graph, paths) if restated is None else restated), forest
+
+
+def _along_odometry(graph: ViewGraph) -> SpanningForest:
+    """The forest that prefers odometry."""
     usable = graph.label != EdgeLabel.REJECTED
     cost = torch.where(graph.is_odometry, 1.0, _CLOSURE_COST)
     # A rejected edge may only be used where nothing else connects.
-    forest = minimum_spanning_forest(graph, torch.where(usable, cost, _CLOSURE_COST**2), is_root=odometry_ends(graph))
-    return contract(graph, forest), forest
+    return minimum_spanning_forest(graph, torch.where(usable, cost, _CLOSURE_COST**2), is_root=odometry_ends(graph))

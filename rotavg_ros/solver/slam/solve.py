@@ -43,7 +43,11 @@ def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     places = estimate.places
     if places is not None:
         places = replace(places, rotation_score=places.rotation_score[says_as], precision=places.precision[says_as])
-    return replace(estimate, outlier_score=estimate.outlier_score[says_as], memory=None, places=places)
+    restated = estimate.restated
+    if restated is not None:
+        restated = torch.isin(says_as, restated).nonzero()[:, 0]
+    score = estimate.outlier_score[says_as]
+    return replace(estimate, outlier_score=score, memory=None, places=places, restated=restated)
 
 
 def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
@@ -62,7 +66,7 @@ def _solve_by_tree(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     with watch.stage("bootstrap"):
         correction = _begin(stages, run, prepared, cleaned)
     with watch.stage("expand"):
-        score = slam_stages.outlier_scores(prepared.closure_graph, 1 - cleaned.inlier_probability)
+        score = slam_stages.outlier_scores(prepared.closure_graph, 1 - cleaned.inlier_probability, 0.0)
         orientations = prepared.closure_graph.orientations(correction)
     return Estimate(orientations, torch.from_numpy(score), torch.full((graph.num_nodes,), torch.nan))
 

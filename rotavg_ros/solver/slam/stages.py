@@ -97,9 +97,10 @@ def bootstrap(prepared: Prepared, cleaned: CleanedClosures) -> Tensor:
     return compose_orientations(forest, closure_graph)
 
 
-def outlier_scores(graph: ClosureGraph, outlier_probability: np.ndarray) -> np.ndarray:
+def outlier_scores(graph: ClosureGraph, outlier_probability: np.ndarray, of_restated: np.ndarray | float) -> np.ndarray:
     """Probability that each edge of the view-graph is wrong, ``(M,)``, from those of the closure graph, ``(E,)``.
 
-    A slip in a segment is equally likely in any of its steps.
+    A slip in a segment is equally likely in any of its steps. ``of_restated`` are those of closures that are made of
+    odometry, one for all or ``(n,)``.
     """
-    return np.asarray(graph.edge_values(outlier_probability) * graph.share_of_segment)
+    return np.asarray(graph.edge_values(outlier_probability, of_restated) * graph.share_of_segment)

@@ -13,6 +13,7 @@ from rotavg_ros.solver.networks import NETWORKS
 from rotavg_ros.solver.neurora.network_store import load_network
 from rotavg_ros.solver.slam.graph.agreement import agreement_pairs
 from rotavg_ros.solver.slam.graph.closure_graph import contract
+from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths
 from rotavg_ros.solver.slam.network import closure_features, false_log_odds
 from rotavg_ros.solver.slam.preparation import prepare
 from test.solver.graphs import measured, random_truth, slam_edges, small_noise
@@ -32,7 +33,7 @@ def test_neighbours_disagree_by_scipys_angle() -> None:
     source, target, kind = slam_edges(60, 40, seed=5)
     graph = measured(random_truth(60, seed=6), source, target, small_noise(len(source), 20.0, seed=7), kind=kind)
     forest = minimum_spanning_forest(graph, torch.where(graph.is_odometry, 1.0, 1e6))
-    contracted = contract(graph, forest)
+    contracted = contract(graph, OdometryPaths.along(graph, forest))
     pairs = agreement_pairs(contracted)
     closure = np.flatnonzero(contracted.is_closure)
     residual = Rotation.from_quat(contracted.residual[closure].numpy())

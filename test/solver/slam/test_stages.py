@@ -48,7 +48,7 @@ def probability_of(graph: ViewGraph, edge: int, log_odds: float | None) -> float
     mode = search(graph, network, bootstrap).modes[0]
     is_told = np.isinf(mode.problem.log_odds)
     probability = np.where(is_told, mode.state.trusted, expit(mode.left_out.log_odds))
-    return float(mode.problem.graph.edge_values(probability)[edge])
+    return float(mode.problem.graph.edge_values(probability, np.nan)[edge])
 
 
 def test_the_network_sways_a_doubtful_verdict_and_not_a_clear_one() -> None:

@@ -23,14 +23,28 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.pointer_jumping import follow
-from rotavg_ros.solver.algebra.spanning_forest import SpanningForest
 from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths
 from rotavg_ros.view_graph import ViewGraph
 
 
 @dataclass(frozen=True)
+class Restated:
+    """n closures that only say what odometry between their ends says; they pull nothing.
+
+    Attributes:
+        edge: ``(n,)`` the view-graph's edges.
+        ends: ``(2, n)`` nodes, source and target.
+        steps: ``(n,)`` odometry steps between them.
+    """
+
+    edge: np.ndarray
+    ends: np.ndarray
+    steps: np.ndarray
+
+
+@dataclass(frozen=True)
 class ClosureGraph:
-    """K key nodes and E edges: S segments first, then every other edge of the view-graph, sorted by its ends.
+    """K key nodes and E edges: S segments first, then other edges of the view-graph, sorted by their ends.
 
     Attributes:
         nodes: ``(K,)`` view-graph nodes, ascending.
@@ -45,6 +59,7 @@ class ClosureGraph:
         stated_variance: ``(E,)`` rad², as stated by closures; NaN where unknown, and for odometry.
         path_steps: ``(E,)`` odometry steps between the edge's ends along the forest; inf if a closure is passed.
         view_graph_edge: ``(E - S,)`` the view-graph edge of each edge that is no segment.
+        restated: closures that are made of odometry and are none of the E edges.
         segment_of_edge: ``(M,)`` the segment that contains each view-graph edge; -1 for edges in none.
         share_of_segment: ``(M,)`` share of its segment's steps that each view-graph edge has; 1 for edges in none.
         paths: paths along the spanning forest, with R⁰.
@@ -61,6 +76,7 @@ class ClosureGraph:
     stated_variance: np.ndarray
     path_steps: np.ndarray
     view_graph_edge: np.ndarray
+    restated: Restated
     segment_of_edge: np.ndarray
     share_of_segment: np.ndarray
     paths: OdometryPaths
@@ -83,6 +99,13 @@ class ClosureGraph:
     @property
     def num_segments(self) -> int:
         return len(self.source) - len(self.view_graph_edge)
+
+    @property
+    def is_restated(self) -> np.ndarray:
+        """``(M,)`` bool, the view-graph's closures that are made of odometry."""
+        out = np.zeros(len(self.segment_of_edge), dtype=bool)
+        out[self.restated.edge] = True
+        return out
 
     @property
     def is_closure(self) -> np.ndarray:
@@ -150,13 +173,28 @@ class ClosureGraph:
         back = rotations.inverse(correction[torch.from_numpy(root[component])])
         return rotations.normalize(rotations.multiply(correction, back))
 
-    def edge_values(self, value: np.ndarray) -> np.ndarray:
-        """Values of this graph's edges ``(E,)`` → values of the view-graph's edges ``(M,)``."""
+    def edge_values(self, value: np.ndarray, restated: np.ndarray | float) -> np.ndarray:
+        """Values of this graph's edges ``(E,)`` → values of the view-graph's edges ``(M,)``.
+
+        Args:
+            value: values of this graph's edges.
+            restated: values of the closures that are made of odometry, one for all or ``(n,)``.
+        """
         out = np.empty(len(self.segment_of_edge))
+        out[self.restated.edge] = restated
         on_segment = self.segment_of_edge >= 0
         out[on_segment] = value[: self.num_segments][self.segment_of_edge[on_segment]]
         out[self.view_graph_edge] = value[self.num_segments :]
         return out
+
+    def off_odometry(self, body_from_world: np.ndarray) -> np.ndarray:
+        """``(n,)`` rad by which orientations ``(N, 4)`` contradict the closures that are made of odometry."""
+        correction = quaternion_rows.multiply(
+            quaternion_rows.inverse(self.odometry_orientation.numpy().T), np.ascontiguousarray(body_from_world.T)
+        )
+        source, target = (correction[:, end] for end in self.restated.ends)
+        turned = quaternion_rows.log(quaternion_rows.multiply(quaternion_rows.inverse(source), target))
+        return np.asarray(np.sqrt((turned**2).sum(axis=0)))
 
     def passing(self, passed: np.ndarray) -> ClosureGraph:
         """The graph with nodes placed within their segments by ``passed`` ``(N,)``, counted from the roots."""
@@ -172,15 +210,23 @@ class ClosureGraph:
         return replace(self, length=self.length * of_node[self.below])
 
 
-def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
-    """The closure graph of ``graph`` (on the CPU), its odometry chains contracted along ``forest``."""
-    paths = OdometryPaths.along(graph, forest)
+def contract(graph: ViewGraph, paths: OdometryPaths, restated: np.ndarray | None = None) -> ClosureGraph:
+    """The closure graph of ``graph`` (on the CPU), its odometry chains contracted along ``paths``.
+
+    Args:
+        graph: N nodes, M edges.
+        paths: its paths along a spanning forest.
+        restated: ``(M,)`` bool, edges that are made of odometry and are left out; default none.
+    """
+    tells = np.ones(len(paths.outside), dtype=bool) if restated is None else ~restated[paths.outside]
+    forest = paths.forest
     num_nodes, num_edges = graph.num_nodes, graph.num_edges
     source, target = graph.source.numpy(), graph.target.numpy()
     is_odometry = graph.is_odometry.numpy()
     steps = graph.steps.numpy()
     parent, parent_edge = forest.parent, forest.parent_edge
-    hangs_on_odometry, depth, other = paths.hangs_on_odometry, paths.depth, paths.outside
+    hangs_on_odometry, depth, other = paths.hangs_on_odometry, paths.depth, paths.outside[tells]
+    left_out = paths.outside[~tells]
 
     children = np.bincount(parent[hangs_on_odometry], minlength=num_nodes)
     is_key = ~hangs_on_odometry | (children != 1)
@@ -219,12 +265,13 @@ def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
         roots=key_of_node[forest.roots],
         source=key_of_node[np.concatenate((segment_start, source[other]))],
         target=key_of_node[np.concatenate((segment_end, target[other]))],
-        residual=torch.cat((rotations.identity(len(segment_end)), paths.residual)),
+        residual=torch.cat((rotations.identity(len(segment_end)), paths.residual[torch.from_numpy(tells)])),
         is_odometry=np.concatenate((np.ones(len(segment_end), dtype=bool), is_odometry[other])),
         own_steps=own_steps,
         stated_variance=np.concatenate((np.full(len(segment_end), np.nan), stated_variance)),
-        path_steps=np.concatenate((segment_steps, paths.path_steps)),
+        path_steps=np.concatenate((segment_steps, paths.path_steps[tells])),
         view_graph_edge=other,
+        restated=Restated(left_out, np.stack((source[left_out], target[left_out])), paths.path_steps[~tells]),
         segment_of_edge=segment_of_edge,
         share_of_segment=share_of_segment,
         paths=paths,

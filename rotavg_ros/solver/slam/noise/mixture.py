@@ -111,6 +111,11 @@ class MixtureFit:
         self._total = np.array([kind.weight * len(kind.steps) for kind in kinds])
         self._constant = float(self._weight @ log_false)
 
+    @property
+    def log_likelihood_if_false(self) -> float:
+        """Log-likelihood of the discrepancies if all of them are false."""
+        return self._constant
+
     def maximise(self, models: Mixtures, iterations: int, *, hold_step: bool = False) -> tuple[Mixtures, np.ndarray]:
         """Iterate the models until none gains; returns also the log-likelihoods ``(S,)`` before the last iteration.
 

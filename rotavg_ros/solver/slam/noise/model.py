@@ -125,6 +125,16 @@ def estimate_noise(data: Sequence[Discrepancies], components: int) -> NoiseModel
     return _model(_least_drift(few, likeliest), components)
 
 
+def likeliest_by_chain(data: Discrepancies, components: int) -> tuple[NoiseModel, float]:
+    """The likeliest noise by discrepancies with odometry alone; its log-likelihood less that if all are false, nats."""
+    kinds = [data, Discrepancies(np.empty(0), np.empty(0), 2, 1.0)]
+    likeliest = _likeliest(kinds, MixtureFit([kind.thinned(_EM_THINNED[0]) for kind in kinds], components), components)
+    if likeliest is None:
+        return _prior(components), 0.0
+    fit = MixtureFit(kinds, components)
+    return _model(likeliest, components), float(fit.step(likeliest)[1][0]) - fit.log_likelihood_if_false
+
+
 def _prior(components: int) -> NoiseModel:
     return NoiseModel(components, _PRIOR_STEP_VARIANCE, _PRIOR_CLOSURE_VARIANCE, 0.25)
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
+from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
 from rotavg_ros.solver.slam.poses.row_errors import bridge_variance, closure_turns, mean_over_axes, mean_turn
@@ -117,7 +119,8 @@ def _of_mode(pose: PoseMode) -> Poses:
     segment = problem.segment_of_node
     spread = pose.state.noise.of_odometry(pose.solved.way.travelled[: drawn.num_segments]) + problem.jumps
     between += passed * (1 - passed) * np.where(segment >= 0, spread[np.maximum(segment, 0)], 0.0)
-    score, rotation = (outlier_scores(drawn, probability) for probability in _scores(pose))
+    of_restated = _scores_of_restated(pose, orientation, position)
+    score, rotation = (outlier_scores(drawn, *each) for each in zip(_scores(pose), of_restated, strict=True))
     if problem.jump is not None:
         score = np.maximum(score, problem.jump > 0)
     return Poses(orientation, position, variance, between, score, rotation, _precision(pose))
@@ -139,14 +142,15 @@ def _precision(pose: PoseMode) -> np.ndarray:
     problem, noise, drawn = pose.problem, pose.state.noise, pose.problem.drawn
     closure, edges = problem.mode.problem.closure, problem.closures
     mean_square = problem.even_turns.mean_square
-    turn = drawn.edge_values(mean_over_axes(problem, 1 / pose.solved.rotation_weight) * mean_square)
+    turn = drawn.edge_values(mean_over_axes(problem, 1 / pose.solved.rotation_weight) * mean_square, np.inf)
     turn *= problem.drawn_steps.share
-    slipped = drawn.edge_values((drawn.is_odometry & ~problem.mode.state.is_good).astype(np.float64))
+    slipped = drawn.edge_values((drawn.is_odometry & ~problem.mode.state.is_good).astype(np.float64), 0.0)
     slip = (problem.priors.slip * problem.typical) ** 2
     shift = noise.of_odometry(problem.travelled) + slipped * drawn.share_of_segment * slip
     if problem.jump is not None:
         shift += problem.jump
     turn[edges] = mean_square[closure] / pose.solved.rotation_weight[closure, 0]
+    shift[drawn.restated.edge] = np.inf
     back = pose.solved.closure_back
     shift[edges] = np.einsum("cij,cij->c", back, back) / problem.shifts
     known = np.isfinite(problem.translation).all(axis=1)
@@ -210,3 +214,21 @@ def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
     score = np.zeros(len(rotation))
     score[closure] = (places.chance * (1 - (1 - turned) * (1 - elsewhere))).sum(axis=0)
     return score, rotation
+
+
+def _scores_of_restated(pose: PoseMode, body_from_world: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, ...]:
+    """``(n,)`` each, as :func:`_scores`, of closures that are made of odometry, at given poses of all nodes."""
+    problem, drawn, noise = pose.problem, pose.problem.drawn, pose.state.noise
+    restated = drawn.restated
+    if len(restated.edge) == 0:
+        return np.zeros(0), np.zeros(0)
+    turned, turn = drawn.off_odometry(body_from_world), restated.steps * mean_turn(problem, noise)
+    rotation = exceedance(turned, turn, OUTLIER_ANGLE, problem.turns)
+    source, target = restated.ends
+    world_from_body = rotations.inverse(torch.from_numpy(body_from_world[source]))
+    stated = rotations.rotate(world_from_body, torch.from_numpy(problem.translation[restated.edge])).numpy()
+    off = np.linalg.norm(position[target] - position[source] - stated, axis=1)
+    way = np.linalg.norm(stated, axis=1)
+    shift = noise.of_odometry(np.stack((way, restated.steps), axis=1)) + turn * way**2
+    place = np.where(np.isnan(off), 0.0, exceedance(off, shift, FALSE_CLOSURE_M, 3 if problem.shifts == 3 else 1))
+    return 1 - (1 - rotation) * (1 - place), rotation

@@ -25,7 +25,7 @@ from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.state import State
-from rotavg_ros.solver.slam.preparation import Prepared, likely_bias, prepare_as_it_is
+from rotavg_ros.solver.slam.preparation import Prepared, likely_bias, made_of_odometry, prepare_as_it_is
 from rotavg_ros.solver.slam.stages import CleanedClosures, clean
 from rotavg_ros.view_graph import ViewGraph
 
@@ -66,7 +66,10 @@ class Drawn:
         ``components`` is k, if it is to differ from that of the corrected rotations.
         """
         corrected = calibrated(graph, calibration)
-        prepared = prepare_as_it_is(corrected, components)
+        restated = None if calibration is None else made_of_odometry(graph)
+        if "restated" in without:
+            restated = np.zeros(graph.num_edges, dtype=bool)
+        prepared = prepare_as_it_is(corrected, components, restated)
         cleaned = clean(network, prepared, graph.label)
         spend(_EDGE * graph.num_edges)
         taken_out = None

@@ -90,4 +90,4 @@ def solved_from(
     fine = fine_tuned(mode, networks[1], passes=1)
     published = publish(problem, [fine])
     spend(_EDGE * graph.num_edges)
-    return SolvedFrom(published, fine, problem.graph.edge_values(mode.state.trusted), mode.state.noise)
+    return SolvedFrom(published, fine, problem.graph.edge_values(mode.state.trusted, 1.0), mode.state.noise)

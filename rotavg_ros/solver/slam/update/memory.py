@@ -109,10 +109,11 @@ class SlamMemory:
             is_divided: whether another answer is nearly as likely.
         """
         problem, state = mode.problem, mode.state
-        trusted = problem.graph.edge_values(state.trusted)
+        trusted = problem.graph.edge_values(state.trusted, 1.0)
         told = estimate.body_from_world, estimate.outlier_score, estimate.variance
         notes = estimate.warnings
-        return cls(graph, trusted, state.noise, mode, calibration, *told, len(problem.closure), is_divided, notes=notes)
+        searched = int((~graph.is_odometry).sum())
+        return cls(graph, trusted, state.noise, mode, calibration, *told, searched, is_divided, notes=notes)
 
     @classmethod
     def of_labels(
@@ -278,6 +279,7 @@ class SlamMemory:
             self.notes,
             step_variance=self.noise.step_variance,
             is_anew=False,
+            restated=torch.from_numpy(self.mode.problem.graph.restated.edge),
         )
         return estimate if poses is None else with_poses(graph, estimate, poses)
 
@@ -290,10 +292,11 @@ def estimate_of(published: Published) -> Estimate:
     """The posterior's answer on the view-graph's nodes and edges."""
     return Estimate(
         published.body_from_world,
-        torch.from_numpy(outlier_scores(published.graph, published.outlier_probability)),
+        torch.from_numpy(outlier_scores(published.graph, published.outlier_probability, published.of_restated)),
         torch.from_numpy(published.variance),
         warnings=published.warnings,
         step_variance=published.noise.step_variance,
+        restated=torch.from_numpy(published.graph.restated.edge),
     )
 
 

@@ -19,7 +19,8 @@ from test.solver.graphs import measured, random_truth, slam_edges, small_noise
 
 
 def _contract(graph: ViewGraph) -> ClosureGraph:
-    return contract(graph, minimum_spanning_forest(graph, torch.where(graph.is_odometry, 1.0, 1e6)))
+    forest = minimum_spanning_forest(graph, torch.where(graph.is_odometry, 1.0, 1e6))
+    return contract(graph, OdometryPaths.along(graph, forest))
 
 
 def _slam_graph(num_nodes: int, num_closures: int, seed: int, noise_deg: float = 0.5) -> ViewGraph:

@@ -12,6 +12,7 @@ from torch import Tensor
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
+from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
 from rotavg_ros.solver.slam.posterior.em import step
 from rotavg_ros.solver.slam.posterior.left_out import leave_one_out, scores
 from rotavg_ros.solver.slam.posterior.mode import OTHER_NOISE, Mode
@@ -38,6 +39,7 @@ class Published:
         graph: the closure graph, with nodes placed along segments by the likeliest noise.
         correction: ``(4, K)``.
         outlier_probability: ``(E,)``.
+        of_restated: ``(n,)`` the same of closures that are made of odometry.
         variance: ``(N,)`` rad², of the view-graph's nodes.
         noise: noise of the likeliest labelling.
         chosen: index of the mode whose orientations are published, the median.
@@ -48,6 +50,7 @@ class Published:
     graph: ClosureGraph
     correction: np.ndarray
     outlier_probability: np.ndarray
+    of_restated: np.ndarray
     variance: np.ndarray
     noise: Noise
     chosen: int
@@ -76,7 +79,10 @@ def publish(problem: Problem, modes: list[Mode], tuned: Callable[[Mode], Mode] =
         quaternion_rows.log(quaternion_rows.multiply(quaternion_rows.inverse(chosen.correction), answer.correction))
         for answer in answers
     ]
-    score = sum(weight * answer.outlier_probability for weight, answer in zip(share, answers, strict=True))
+    score, of_restated = (
+        sum(weight * getattr(answer, name) for weight, answer in zip(share, answers, strict=True))
+        for name in ("outlier_probability", "of_restated")
+    )
     graph, k = chosen.graph, problem.components
     variance = np.zeros(len(chosen.variance))
     for weight, answer, turn in zip(share, answers, turns, strict=True):
@@ -86,9 +92,9 @@ def publish(problem: Problem, modes: list[Mode], tuned: Callable[[Mode], Mode] =
     warnings = _warnings(problem, rivals, share, turns)
     number = next(number for number, mode in enumerate(modes) if mode is rivals[middle])
     # Shares add up to one up to rounding.
-    score = np.clip(score, 0.0, 1.0)
-    noise = answers[0].noise
-    return Published(graph, chosen.correction, score, variance, noise, number, tuple(share.tolist()), warnings)
+    score, of_restated = (np.clip(each, 0.0, 1.0) for each in (score, of_restated))
+    told = score, of_restated, variance, answers[0].noise
+    return Published(graph, chosen.correction, *told, number, tuple(share.tolist()), warnings)
 
 
 def median(corrections: list[np.ndarray], share: np.ndarray) -> int:
@@ -182,4 +188,9 @@ def of_mode(mode: Mode) -> Published:
     spend(_SCORED * len(state.trusted))
     graph, held = problem.drawn(state.noise), held_by_gravity(problem, state, factorised)
     variance = graph.variance(held.variance, held.apart, held.step_variance)
-    return Published(graph, held.state.correction, score, variance, state.noise, 0, (1.0,))
+    answer = Published(graph, held.state.correction, score, np.zeros(0), variance, state.noise, 0, (1.0,))
+    if len(graph.restated.edge) == 0:
+        return answer
+    off = graph.off_odometry(answer.body_from_world.numpy())
+    of_restated = exceedance(off, graph.restated.steps * held.step_variance, OUTLIER_ANGLE, problem.components)
+    return replace(answer, of_restated=of_restated)

@@ -1,0 +1,128 @@
+"""Closures over a few keyframes that are made of odometry, and so tell nothing that odometry does not.
+
+Some front ends link each keyframe to several before it by the poses that odometry gave them (VINS' sequential edges,
+the edges of ORB-SLAM's essential graph). Such an edge has odometry's errors, and perhaps some of its own. Taken for a
+measurement, it seems to prove that odometry errs less than it does, and right loop closures then seem false.
+
+A measurement beside odometry sees odometry's errors: its discrepancy has their variance, and two that span the same
+steps have it in common. What is made of odometry does not see them. Loop closures do, so they tell how large they are.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths
+from rotavg_ros.solver.slam.noise.mixture import Discrepancies
+from rotavg_ros.solver.slam.noise.model import likeliest_by_chain
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+
+# Bounds of bands of steps that are judged by themselves. What spans more is a loop closure.
+_BANDS = (0.0, 4.0, 8.0, 16.0, 32.0)
+# Closures are made of odometry if they see at most this share of the variance that loop closures see, with all but this
+# probability or by so many standard errors.
+_SEEN, _UNLIKELY, _SIGMAS = 0.25, 0.001, 3.0
+# Edges are compared with so many others that begin next; fewer pairs than this say nothing.
+_NEXT, _FEW = 4, 30
+# Nats by which loop closures must show that some of them are good.
+_EVIDENCE = 5.0
+# Number of standard deviations of its kind at which an edge is none of it, and the rounding error of a file's six
+# digits, rad.
+_FARTHEST, _ROUNDING = 4.0, 5e-6
+
+
+def restated_odometry(graph: ViewGraph, paths: OdometryPaths) -> np.ndarray:
+    """``(M,)`` bool, which closures do not see odometry's errors, and differ from it no more than others of their kind.
+
+    Args:
+        graph: as it was measured.
+        paths: its paths along a forest that prefers odometry.
+    """
+    restated = np.zeros(graph.num_edges, dtype=bool)
+    chosen = ~graph.is_odometry.numpy()[paths.outside] & np.isfinite(paths.path_steps)
+    chosen &= graph.label.numpy()[paths.outside] == EdgeLabel.AUTOMATIC
+    steps = paths.path_steps[chosen]
+    is_loop = steps > _BANDS[-1]
+    if is_loop.all() or not is_loop.any():
+        return restated
+    edge, k = paths.outside[chosen], graph.rotation_components
+    seen = _Seen.of(graph, paths, chosen)
+    square = (seen.off**2).sum(axis=1)
+    bands = [np.flatnonzero((steps > low) & (steps <= high)) for low, high in pairwise(_BANDS)]
+    bounds = [seen.most_variance(band, k) for band in bands]
+    # Of good loop closures this is more than odometry's variance: the larger part of them need not be good.
+    if min(bounds) > _SEEN * float(np.median(square[is_loop] / steps[is_loop])) / _quantile(0.5, k):
+        return restated
+    loops = Discrepancies(square[is_loop], steps[is_loop], 1, 1.0)
+    noise, evidence = likeliest_by_chain(loops, k)
+    for band, most in zip(bands, bounds, strict=True):
+        if evidence > _EVIDENCE and most <= _SEEN * noise.step_variance:
+            restated[edge[band[square[band] <= _FARTHEST**2 * k * _usual(square[band], k)]]] = True
+    return restated
+
+
+def _quantile(probability: float, freedom: int) -> float:
+    """Quantile of χ² with some degrees of freedom."""
+    return float(2 * gammaincinv(freedom / 2, probability))
+
+
+def _usual(square: np.ndarray, components: int) -> float:
+    """rad² per component, variance of rotations with these squared angles if most of them are of one kind."""
+    return max(float(np.median(square)) / _quantile(0.5, components), _ROUNDING**2)
+
+
+class _Seen(NamedTuple):
+    """What n closures see of odometry's errors.
+
+    Attributes:
+        off: ``(n, 3)`` rad, discrepancies with odometry, from the older end to the newer, in a common frame.
+        first, last: ``(n,)`` positions of the ends along odometry; chains are far apart.
+    """
+
+    off: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+
+    @classmethod
+    def of(cls, graph: ViewGraph, paths: OdometryPaths, chosen: np.ndarray) -> _Seen:
+        """Of those of the edges outside the forest that ``(F,)`` bool chooses."""
+        edge = paths.outside[chosen]
+        apart = paths.position.max(initial=0.0) + 1.0
+        position = paths.position + apart * np.unique(paths.chain, return_inverse=True)[1]
+        ends = np.stack([position[each.numpy()[edge]] for each in (graph.source, graph.target)])
+        off = rotations.log(paths.residual).numpy()[chosen]
+        return cls(np.where((ends[0] > ends[1])[:, None], -off, off), ends.min(axis=0), ends.max(axis=0))
+
+    def most_variance(self, among: np.ndarray, components: int) -> float:
+        """rad² a step: bound on the variance of odometry that these closures ``(m,)`` see; inf if there are none.
+
+        Their own squares contain it. Over few steps, where their own errors are larger, products of two that overlap
+        tell more.
+        """
+        if len(among) == 0:
+            return np.inf
+        order = among[np.argsort(self.first[among], kind="stable")]
+        off, first, last = self.off[order], self.first[order], self.last[order]
+        square = (off**2).sum(axis=1)
+        # False closures are not to hide what the others have in common.
+        farthest = _FARTHEST**2 * components * _usual(square, components)
+        off *= np.sqrt(np.minimum(1.0, farthest / np.maximum(square, _ROUNDING**2)))[:, None]
+        square = np.minimum(square, farthest)
+        least = float((square / (last - first)).sum() / _quantile(_UNLIKELY, components * len(among)))
+        product, overlap = [], []
+        for ahead in range(1, _NEXT + 1):
+            common = np.minimum(last[:-ahead], last[ahead:]) - first[ahead:]
+            shares = (common > 0) & ((last - first)[ahead:] <= _BANDS[1])
+            product.append((off[:-ahead] * off[ahead:]).sum(axis=1)[shares])
+            overlap.append(common[shares])
+        value, common = np.concatenate(product), np.concatenate(overlap)
+        if len(value) < _FEW:
+            return least
+        mean = value.sum() / common.sum()
+        error = np.sqrt(((value - mean * common) ** 2).sum()) / common.sum()
+        return min(least, float(mean + _SIGMAS * error) / components)
