@@ -284,13 +284,13 @@ def test_a_flood_is_survived_and_every_loss_counted(live_node) -> None:
         ("keyframe_angle_deg:=fast", "keyframe_angle_deg is 'fast'; it must be a number"),
         ("edge_topics:=['x:nobodys_msgs/msg/Edge']", "nobodys_msgs/msg/Edge"),
         pytest.param("qos_overrides./odom.subscription.depth:=many", "odom", marks=pytest.mark.large),
-        ("odometry_topics:=[]", "odometry_topics is empty"),
+        pytest.param("odometry_topics:=[]", "odometry_topics is empty", marks=pytest.mark.large),
         pytest.param("use_sim_time:=perhaps", "use_sim_time", marks=pytest.mark.large),
         pytest.param(
             "state_file:=/no/such/folder/state", "there is no folder /no/such/folder", marks=pytest.mark.large
         ),
-        ("world_frame:=''", "world_frame is ''; name the frame"),
-        ("weights:=/no/such/folder", "/no/such/folder: has no weights"),
+        pytest.param("world_frame:=''", "world_frame is ''; name the frame", marks=pytest.mark.large),
+        pytest.param("weights:=/no/such/folder", "/no/such/folder: has no weights", marks=pytest.mark.large),
     ],
 )
 def test_a_mistake_at_the_start_is_one_line_and_exit_code_2(parameter: str, message: str) -> None:

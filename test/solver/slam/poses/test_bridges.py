@@ -75,7 +75,7 @@ def test_a_closure_that_alone_joins_two_robots_is_as_likely_false_as_others_are(
 
 
 @pytest.mark.parametrize("planar", [True, False])
-@pytest.mark.parametrize(("bridges", "false", "loops"), [(2, 0, 0), (3, 1, 5), (10, 3, 0), (10, 3, 10)])
+@pytest.mark.parametrize(("bridges", "false", "loops"), [(2, 0, 0), (3, 1, 5), (10, 3, 0)])
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.large) for seed in (1, 2))])
 def test_bridges_that_agree_are_believed_and_the_others_are_not(planar, bridges, false, loops, seed):
     graph, is_false = two_robots(bridges, false, loops, planar, seed)

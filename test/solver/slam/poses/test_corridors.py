@@ -132,7 +132,7 @@ def walk(seed: int) -> Walk:
     return Walk(graph, position, np.arange(len(source)) >= len(right))
 
 
-@pytest.mark.parametrize("seed", [66, 70, 118])
+@pytest.mark.parametrize("seed", [66, *(pytest.param(seed, marks=pytest.mark.large) for seed in (70, 118))])
 def test_runs_that_agree_between_the_walls_are_no_slip(seed: int) -> None:
     """A part that only false closures lead to, by turns near a right angle: with a slip, a run would be right.
 

@@ -13,7 +13,9 @@ from rotavg_ros.evaluation.slam import stress
 
 
 @pytest.mark.parametrize(("alike", "most"), [(",shift-axes", 0.05), ("", 0.3)])
-@pytest.mark.parametrize("kind", ["building: uneven odometry", "building: odometry worse in turns"])
+@pytest.mark.parametrize(
+    "kind", ["building: uneven odometry", pytest.param("building: odometry worse in turns", marks=pytest.mark.large)]
+)
 def test_least_squares_with_published_precisions_is_the_answer(kind: str, alike: str, most: float) -> None:
     """Tails of odometry, its turns, what FineNet makes of each edge, and closures that hardly count."""
     gtsam = pytest.importorskip("gtsam")
