@@ -145,8 +145,9 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "update": {"fine_net", "graph", "network", "noise", "poses", "posterior", "stages"},
         "stages": {"graph", "network", "noise", "preparation"},
         "posterior": {"graph", "network", "noise", "preparation", "stages"},
+        "links": {"fine_net", "network", "noise", "poses", "preparation", "update"},
         "solve": {
-            *("fine_net", "graph", "network", "noise", "options", "poses"),
+            *("fine_net", "graph", "links", "network", "noise", "options", "poses"),
             *("posterior", "preparation", "stages", "update"),
         },
         "live": {"fine_net", "graph", "network", "options", "poses", "posterior", "solve", "update"},

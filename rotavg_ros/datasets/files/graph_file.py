@@ -28,6 +28,8 @@ MAX_NODE_ID = np.iinfo(np.int64).max
 
 # With fewer ids, or a smaller share of neighbours that are joined, the nodes may be cameras instead of keyframes.
 _MIN_CHAIN, _CHAIN_SHARE = 10, 0.9
+# Largest number of keyframes in a row that a front end drops again.
+_DROPPED = 30
 
 _GZIP, _ZIP = b"\x1f\x8b", b"PK"
 
@@ -164,9 +166,9 @@ class GraphFile:
 def joins_consecutive(source_ids: np.ndarray, target_ids: np.ndarray) -> np.ndarray:
     """``(M,)`` bool: which edges are odometry, judged only by ids.
 
-    These are edges between consecutive ids; or, where a front end numbers frames and keeps some (0, 5, 10 …), edges
-    between ids that follow each other among those that occur. The latter holds if such edges join nearly all ids that
-    follow each other, and most of these do not differ by one.
+    These are edges between consecutive ids. Where a front end numbers frames and keeps some (0, 5, 10 …), or drops some
+    of its keyframes (3, 4, 6, 7 …), they are the edges between ids that follow each other among those that occur. That
+    holds if such edges join nearly all of these; far ids are another robot's.
 
     Args:
         source_ids, target_ids: ``(M,)`` int64.
@@ -176,9 +178,10 @@ def joins_consecutive(source_ids: np.ndarray, target_ids: np.ndarray) -> np.ndar
     ends = index.reshape(2, -1)
     is_next = np.abs(ends[0] - ends[1]) == 1
     joined = np.unique(ends[:, is_next].min(axis=0))
-    num_by_one = int((np.diff(ids)[joined] == 1).sum())
-    is_chain = len(ids) >= _MIN_CHAIN and len(joined) >= _CHAIN_SHARE * (len(ids) - 1)
-    return np.asarray(is_next if is_chain and 2 * num_by_one < len(joined) else consecutive)
+    if len(ids) < _MIN_CHAIN or len(joined) < _CHAIN_SHARE * (len(ids) - 1):
+        return np.asarray(consecutive)
+    usual = float(np.median(np.diff(ids)[joined]))
+    return np.asarray(is_next & (np.abs(source_ids - target_ids) <= (_DROPPED + 1) * usual))
 
 
 @contextmanager

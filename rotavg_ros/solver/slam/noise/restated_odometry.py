@@ -22,8 +22,9 @@ from rotavg_ros.solver.slam.noise.mixture import Discrepancies
 from rotavg_ros.solver.slam.noise.model import likeliest_by_chain
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-# Bounds of bands of steps that are judged by themselves. What spans more is a loop closure.
-_BANDS = (0.0, 4.0, 8.0, 16.0, 32.0)
+# What spans more steps is a loop closure; bounds of bands of steps that are judged by themselves.
+LOOP_STEPS = 32.0
+_BANDS = (0.0, 4.0, 8.0, 16.0, LOOP_STEPS)
 # Closures are made of odometry if they see at most this share of the variance that loop closures see, with all but this
 # probability or by so many standard errors.
 _SEEN, _UNLIKELY, _SIGMAS = 0.25, 0.001, 3.0
@@ -47,7 +48,7 @@ def restated_odometry(graph: ViewGraph, paths: OdometryPaths) -> np.ndarray:
     chosen = ~graph.is_odometry.numpy()[paths.outside] & np.isfinite(paths.path_steps)
     chosen &= graph.label.numpy()[paths.outside] == EdgeLabel.AUTOMATIC
     steps = paths.path_steps[chosen]
-    is_loop = steps > _BANDS[-1]
+    is_loop = steps > LOOP_STEPS
     if is_loop.all() or not is_loop.any():
         return restated
     edge, k = paths.outside[chosen], graph.rotation_components
