@@ -12,15 +12,14 @@ from rotavg_ros.cli.main import main
 
 def test_a_tiny_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("pycolmap")
-    pytest.importorskip("gtsam")
     options = ["--families", "sfm-sparse", "--max-pairs", "1000", "--minutes", "4", "--repeats", "2"]
-    options += ["--contenders", "neurora", "neurora-v1", "colmap", "shonan"]
+    options += ["--contenders", "neurora", "neurora-v1", "colmap"]
     assert main(["benchmark", *options, "--output", str(tmp_path)]) == 0
     assert str(tmp_path / "benchmark.md") in capsys.readouterr().out
     with (tmp_path / "benchmark-sfm-sparse.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["solver"] for row in rows][:2] == ["rotavg", "rotavg without refinement"]
-    assert {"COLMAP", "GTSAM Shonan"} <= {row["solver"] for row in rows}
+    assert "COLMAP" in {row["solver"] for row in rows}
     for row in rows:
         assert row["nodes"] == "100"
         assert 0 < float(row["fastest"]) <= float(row["s"]) <= float(row["slowest"])
@@ -32,6 +31,7 @@ def test_a_tiny_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert "## Our stages" in (tmp_path / "benchmark.md").read_text()
 
 
+@pytest.mark.large
 def test_hours_of_driving_with_a_limit(tmp_path: Path) -> None:
     options = ["--soak", "--hours", "0.12", "--max-keyframes", "150"]
     assert main(["benchmark", *options, "--output", str(tmp_path)]) == 0

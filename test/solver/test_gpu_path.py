@@ -68,6 +68,7 @@ def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> Non
     assert len(traffic.waits) <= waits
 
 
+@pytest.mark.large
 def test_information_goes_along() -> None:
     graph = _graph(30)
     rng = np.random.default_rng(1)

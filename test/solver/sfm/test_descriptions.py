@@ -132,7 +132,7 @@ def _furthest_deg(found: Tensor, expected: Tensor) -> float:
         for name in (*NETWORK_METHODS, "neurora-paper~axes", *BASELINES)
     ],
 )
-@pytest.mark.parametrize("kind", ["released", "paper"])
+@pytest.mark.parametrize("kind", ["released", pytest.param("paper", marks=pytest.mark.large)])
 def test_the_cameras_axes_do_not_matter(kind: str, method: str) -> None:
     sample = SAMPLES[kind]
     expected = _solved(sample.graph, method)
