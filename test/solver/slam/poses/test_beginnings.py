@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from rotavg_ros import solve
+from rotavg_ros.datasets.simulation.slam_config import World
+from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.solver.slam.poses.em.convergence import Ending
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
-from rotavg_ros.solver.slam.poses.search.beginnings import begun_at_runs, runs_to_begin_at
+from rotavg_ros.solver.slam.poses.search.beginnings import begun_at_runs, could_be_right_together, runs_to_begin_at
 from rotavg_ros.solver.slam.poses.search.settling import Rival
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 
@@ -43,3 +46,26 @@ def test_a_right_run_that_false_ones_outdo_is_found_and_nothing_that_is_false() 
     assert ((truth.pose.solved.places.right < 0.5) == is_false).all()
     assert runs_to_begin_at(truth.pose) == []
     assert begun_at_runs(truth) is truth
+
+
+def test_closures_that_contradict_each_other_are_no_beginning() -> None:
+    """Where closures are many, random ones are near each other by chance, and odometry predicts some of them well."""
+    config = SlamSimulationConfig(
+        world=World.CITY,
+        num_keyframes=500,
+        laps=4,
+        keyframe_distance_m=2.0,
+        closure_radius_m=6.0,
+        closures_per_keyframe=1.0,
+        false_share=0.2,
+    )
+    run = simulate_slam_graph(config, np.random.default_rng(0))
+    pose = pose_mode(run.to_graph_file().graph)
+    alone = estimate_poses(pose.problem, ending=Ending(held_for=1))
+    rejected = pose.solved.places.right < 0.5
+    of_runs = [np.flatnonzero(rejected & (pose.problem.told.run == each)) for each in np.unique(pose.problem.told.run)]
+    contradicting = [each for each in of_runs if len(each) > 1 and not could_be_right_together(alone, each)]
+    assert len(contradicting) >= 5
+    assert runs_to_begin_at(pose) == []
+    twice = np.repeat(contradicting[0][:1], 2)
+    assert could_be_right_together(alone, twice)

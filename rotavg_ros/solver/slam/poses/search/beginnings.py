@@ -6,11 +6,14 @@ estimated from rotations alone again, with such a run believed before all others
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 
 from rotavg_ros.solver.slam.poses.em.convergence import Ending
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
+from rotavg_ros.solver.slam.poses.row_errors import stated_variance
 from rotavg_ros.solver.slam.poses.search.runs import run_discrepancies, with_runs, without_runs
 from rotavg_ros.solver.slam.poses.search.settling import LEAST_GAIN, Rival, moved
 from rotavg_ros.solver.slam.poses.solved import PoseMode
@@ -18,6 +21,9 @@ from rotavg_ros.solver.slam.poses.solved import PoseMode
 # Maximum number of rounds, and of runs that are tried in each, those that odometry predicts best first.
 _MAX_ROUNDS, _MAX_RUNS = 4, 3
 _WRONG = 0.5
+# Number of standard deviations, in each component, by which closures of a run differ at most that agree; what odometry
+# errs by between them is included.
+_FAR = 5.0
 
 
 def begun_at_runs(rival: Rival) -> Rival:
@@ -50,6 +56,21 @@ def runs_to_begin_at(pose: PoseMode) -> list[np.ndarray]:
     believed = run_discrepancies(alone, could & (right > _WRONG))
     rejected = run_discrepancies(alone, could & (right < _WRONG))
     worst = float(believed[np.isfinite(believed)].max(initial=0.0))
-    order = [run for run in np.argsort(rejected, kind="stable")[:_MAX_RUNS] if rejected[run] < worst]
-    found = [np.flatnonzero(could & (right < _WRONG) & (told.run == run)) for run in order]
+    order = (run for run in np.argsort(rejected, kind="stable") if rejected[run] < worst)
+    members = (np.flatnonzero(could & (right < _WRONG) & (told.run == run)) for run in order)
+    found = list(islice((each for each in members if could_be_right_together(alone, each)), _MAX_RUNS))
     return [*found, np.array([], dtype=np.int64)] if found else []
+
+
+def could_be_right_together(pose: PoseMode, members: np.ndarray) -> bool:
+    """Whether any two closures of a run ``(n,)`` contradict what predicts them by the same, up to their own errors.
+
+    Random closures that are near each other do not: no two of them can both be right.
+    """
+    told, mean, k = pose.problem.told, pose.solved.predictions.mean, pose.problem.turns
+    own = np.stack((told.rotation_variance, stated_variance(pose.problem, pose.state)), axis=1)[members]
+    variance = np.repeat(own, [k, mean.shape[1] - k], axis=1)
+    off = told.sign[members, None] * mean[members]
+    one, other = np.triu_indices(len(members), 1)
+    square = ((off[one] - off[other]) ** 2 / (variance[one] + variance[other])).sum(axis=1)
+    return bool((square < _FAR**2 * mean.shape[1]).any())
