@@ -15,7 +15,7 @@ from rotavg_ros.solver.estimate import Run, Stopwatch
 from rotavg_ros.solver.neurora.network_store import Networks
 from rotavg_ros.solver.slam.links import links_of, solved_in_two_parts
 from rotavg_ros.solver.slam.options import SlamStages
-from rotavg_ros.solver.slam.solve import _whole
+from rotavg_ros.solver.slam.solve import whole
 from rotavg_ros.view_graph import ViewGraph
 
 from .linked_keyframes import SPANS, drawn, error_deg, linked
@@ -30,7 +30,7 @@ def in_two_parts(graph: ViewGraph) -> bool:
     links, run = links_of(graph), Run(Networks("cpu"), Stopwatch())
     assert links is not None
     with torch.no_grad():
-        return solved_in_two_parts(graph, links, lambda reduced: _whole(reduced, SlamStages(), run), run) is not None
+        return solved_in_two_parts(graph, links, lambda reduced: whole(reduced, SlamStages(), run), run) is not None
 
 
 @pytest.mark.parametrize("translations", [False, pytest.param(True, marks=pytest.mark.large)])

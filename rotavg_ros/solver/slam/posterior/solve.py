@@ -66,9 +66,11 @@ class Drawn:
         ``components`` is k, if it is to differ from that of the corrected rotations.
         """
         corrected = calibrated(graph, calibration)
-        restated = None if calibration is None else made_of_odometry(graph)
+        restated: np.ndarray | None = None
         if "restated" in without:
             restated = np.zeros(graph.num_edges, dtype=bool)
+        elif calibration is not None:
+            restated = made_of_odometry(graph)
         prepared = prepare_as_it_is(corrected, components, restated)
         cleaned = clean(network, prepared, graph.label)
         spend(_EDGE * graph.num_edges)

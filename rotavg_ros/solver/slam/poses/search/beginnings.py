@@ -14,7 +14,7 @@ from rotavg_ros.solver.slam.poses.em.convergence import Ending
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.row_errors import stated_variance
-from rotavg_ros.solver.slam.poses.search.runs import run_discrepancies, with_runs, without_runs
+from rotavg_ros.solver.slam.poses.search.runs import MOST_MEMBERS, run_discrepancies, with_runs, without_runs
 from rotavg_ros.solver.slam.poses.search.settling import LEAST_GAIN, Rival, moved
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 
@@ -68,6 +68,7 @@ def could_be_right_together(pose: PoseMode, members: np.ndarray) -> bool:
     Random closures that are near each other do not: no two of them can both be right.
     """
     told, mean, k = pose.problem.told, pose.solved.predictions.mean, pose.problem.turns
+    members = members[:MOST_MEMBERS]
     own = np.stack((told.rotation_variance, stated_variance(pose.problem, pose.state)), axis=1)[members]
     variance = np.repeat(own, [k, mean.shape[1] - k], axis=1)
     off = told.sign[members, None] * mean[members]

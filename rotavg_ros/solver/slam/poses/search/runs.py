@@ -30,7 +30,7 @@ from rotavg_ros.solver.slam.poses.solved import PoseMode
 # Maximum number of rejected runs that are examined, those with the smallest mean offset first; minimum number of
 # closures in a run; and maximum number of its closures that are examined. The rest of a longer run follows in the
 # estimate that begins with these believed.
-_LOOKED_AT, _LEAST_MEMBERS, _MOST_MEMBERS = 32, 2, 96
+_LOOKED_AT, _LEAST_MEMBERS, MOST_MEMBERS = 32, 2, 96
 _WRONG = 0.5
 # Expected share of right runs among those doubted, at most.
 _UNLIKELY = 0.05
@@ -146,7 +146,7 @@ def _nearest(pose: PoseMode, could: np.ndarray) -> list[np.ndarray]:
     """Closures of each rejected run, the run whose mean discrepancy is the fewest standard deviations first."""
     run, square = pose.problem.told.run, run_discrepancies(pose, could)
     order = np.argsort(square, kind="stable")[:_LOOKED_AT]
-    return [np.flatnonzero(could & (run == each))[:_MOST_MEMBERS] for each in order if np.isfinite(square[each])]
+    return [np.flatnonzero(could & (run == each))[:MOST_MEMBERS] for each in order if np.isfinite(square[each])]
 
 
 @dataclass(frozen=True)
