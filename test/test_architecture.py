@@ -142,15 +142,15 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "network": {"graph", "noise"},
         "poses": {"graph", "noise", "posterior", "preparation", "stages"},
         "fine_net": {"graph", "posterior"},
-        "update": {"fine_net", "graph", "network", "noise", "poses", "posterior", "stages"},
+        "update": {"fine_net", "graph", "links", "network", "noise", "poses", "posterior", "stages"},
         "stages": {"graph", "network", "noise", "preparation"},
         "posterior": {"graph", "network", "noise", "preparation", "stages"},
-        "links": {"fine_net", "network", "noise", "poses", "preparation", "update"},
+        "links": {"graph", "noise"},
         "solve": {
             *("fine_net", "graph", "links", "network", "noise", "options", "poses"),
             *("posterior", "preparation", "stages", "update"),
         },
-        "live": {"fine_net", "graph", "network", "options", "poses", "posterior", "solve", "update"},
+        "live": {"fine_net", "graph", "links", "network", "options", "poses", "posterior", "solve", "update"},
     },
     "solver/slam/fine_net": {
         "": set(),

@@ -1,82 +1,124 @@
-"""Solves a graph in which most closures span few keyframes: a search without these, then a solve with them.
+"""Measured closures over few keyframes: odometry that spans several steps.
 
-A search tries labellings, and each costs a solve of all closures. Those over few keyframes hardly change which loop
-closures are likely: odometry spans as little about as well. So the search is made without them, and its labels are
-where the solve with all of them begins. Where they contradict that, the search is made with all of them after all.
+Many front ends match each keyframe with several before it (VINS, the covisibility edges of ORB-SLAM, scan matchers).
+Such a link errs about as odometry does, not as a loop closure, which is taken from another place at another time. With
+one variance for both, loop closures would be believed far too much. So links that agree with odometry between their
+ends are odometry beside the chain; its variance relative to the chain's is estimated. Links that do not agree stay
+closures: they may be false, or odometry may have slipped below them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from rotavg_ros.solver.estimate import Estimate, Run
-from rotavg_ros.solver.running.kept_labels import KeptLabels
-from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
-from rotavg_ros.solver.slam.network import SlamCleanNet
-from rotavg_ros.solver.slam.noise.restated_odometry import LOOP_STEPS
-from rotavg_ros.solver.slam.poses.solve import poses_of_kept
-from rotavg_ros.solver.slam.preparation import contract_odometry
-from rotavg_ros.solver.slam.update.memory import SlamMemory, with_poses
-from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
+from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths, odometry_forest
+from rotavg_ros.solver.slam.noise.restated_odometry import LOOP_STEPS, is_of_its_kind, restated_odometry
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
 
-# Links are set aside if there are as many as other closures, and at least so many of either.
-_LEAST_LINKS, _LEAST_OTHERS = 100, 10
-# Largest share of closures that may contradict the labels of the search.
-_CONTRADICTING = 0.02
-_GOOD = 0.5
+# Links are odometry if there are as many as other closures, and at least so many.
+_LEAST_LINKS = 100
 
 
-def links_of(graph: ViewGraph) -> np.ndarray | None:
-    """``(n,)`` measured closures over few keyframes; None unless they are most of all closures."""
-    if int((~graph.is_odometry).sum()) < _LEAST_LINKS + _LEAST_OTHERS:
-        return None
-    drawn, _ = contract_odometry(graph)
-    outside = drawn.view_graph_edge
-    is_closure = drawn.is_closure[drawn.num_segments :]
-    is_link = is_closure & (drawn.path_steps[drawn.num_segments :] <= LOOP_STEPS)
-    is_link &= graph.label.numpy()[outside] == EdgeLabel.AUTOMATIC
-    links, others = int(is_link.sum()), int((is_closure & ~is_link).sum())
-    return outside[is_link] if links >= max(_LEAST_LINKS, others) and others >= _LEAST_OTHERS else None
+def with_links(graph: ViewGraph) -> tuple[ViewGraph, np.ndarray]:
+    """The graph with links as odometry, and ``(n,)`` these edges; none unless links are most of all closures.
+
+    An edge over k steps has k times the variance of a step, times the factor of all odometry beside the chain.
+    """
+    if int((~graph.is_odometry).sum()) < _LEAST_LINKS:
+        return graph, np.zeros(0, dtype=np.int64)
+    short = _Short.of(graph)
+    others = int((~graph.is_odometry).sum()) - len(short.edge)
+    if len(short.edge) < max(_LEAST_LINKS, others):
+        return graph, np.zeros(0, dtype=np.int64)
+    return short.as_odometry(graph, np.zeros(0, dtype=np.int64), 0)
 
 
-def solved_in_two_parts(
-    graph: ViewGraph, links: np.ndarray, whole: Callable[[ViewGraph], Estimate], run: Run
-) -> Estimate | None:
-    """The answer of a search without links ``(n,)``, and a solve with them; None if they contradict it.
-
-    Also if odometry slipped or jumped, which links place best, or other labellings are nearly as likely.
+def with_more_links(graph: ViewGraph, links: np.ndarray, known: int) -> tuple[ViewGraph, np.ndarray]:
+    """The same for a graph that has grown: new closures are links if they agree with odometry as known links do.
 
     Args:
         graph: N nodes, M edges.
-        links: those of :func:`links_of`.
-        whole: solves a graph by the whole search.
-        run: arguments of the solve.
+        links: ``(n,)`` edges that are odometry in it already.
+        known: number of edges that it had before; older closures stay closures.
     """
-    others = np.setdiff1d(np.arange(graph.num_edges), links)
-    first = whole(graph.select_edges(torch.from_numpy(others)))
-    memory = first.memory
-    if not isinstance(memory, SlamMemory) or memory.is_divided or len(memory.mode.slipped):
+    if len(links) == 0 or graph.num_edges == known:
+        return graph, links
+    return _Short.of(graph, links).as_odometry(graph, links, known)
+
+
+def as_odometry(graph: ViewGraph, links: np.ndarray, steps: np.ndarray) -> ViewGraph:
+    """The graph in which edges ``(n,)`` are odometry over ``steps`` ``(n,)``."""
+    kind, passed = graph.kind.clone(), graph.steps.clone()
+    kind[links], passed[links] = EdgeKind.ODOMETRY, torch.from_numpy(steps)
+    return replace(graph, kind=kind, steps=passed)
+
+
+def as_closures(graph: ViewGraph, links: np.ndarray) -> ViewGraph:
+    """The graph in which edges ``(n,)`` are the closures that they were."""
+    kind, passed = graph.kind.clone(), graph.steps.clone()
+    kind[links], passed[links] = EdgeKind.LOOP_CLOSURE, 1.0
+    return replace(graph, kind=kind, steps=passed)
+
+
+class _Short(NamedTuple):
+    """n edges beside the chain over few keyframes, neither made of odometry nor rejected.
+
+    Attributes:
+        edge: ``(n,)``.
+        steps: ``(n,)`` odometry steps between their ends.
+        agrees: ``(n,)`` bool, whether they differ from odometry by no more than is usual per step.
+    """
+
+    edge: np.ndarray
+    steps: np.ndarray
+    agrees: np.ndarray
+
+    @classmethod
+    def of(cls, graph: ViewGraph, links: Sequence[int] | np.ndarray = ()) -> _Short:
+        """Closures, and edges that are links already."""
+        paths = OdometryPaths.along(graph, odometry_forest(graph))
+        outside = paths.outside
+        chosen = np.isin(outside, links) | ~graph.is_odometry.numpy()[outside]
+        chosen &= (paths.path_steps <= LOOP_STEPS) & ~restated_odometry(graph, paths)[outside]
+        chosen &= graph.label.numpy()[outside] != EdgeLabel.REJECTED
+        edge, steps = outside[chosen], paths.path_steps[chosen]
+        turned = (rotations.log(paths.residual).numpy()[chosen] ** 2).sum(axis=1)
+        shifted = _shifted(graph, paths, edge)
+        agrees = is_of_its_kind(turned / steps, graph.rotation_components)
+        if shifted is not None:
+            agrees &= np.isnan(shifted) | is_of_its_kind(shifted / steps, 3)
+        return cls(edge, steps, agrees)
+
+    def as_odometry(self, graph: ViewGraph, links: np.ndarray, known: int) -> tuple[ViewGraph, np.ndarray]:
+        """The graph in which those from edge ``known`` on that agree are odometry, and ``(n,)`` these and ``links``."""
+        more = np.flatnonzero(self.agrees & (self.edge >= known))
+        more = more[np.argsort(self.edge[more])]
+        return as_odometry(graph, self.edge[more], self.steps[more]), np.concatenate((links, self.edge[more]))
+
+
+def _shifted(graph: ViewGraph, paths: OdometryPaths, edge: np.ndarray) -> np.ndarray | None:
+    """``(n,)`` m², squared discrepancies of edges' translations with odometry's; NaN where unknown. None without any.
+
+    Where odometry states no translations, those of closures say nothing.
+    """
+    if graph.translation is None:
         return None
-    found = memory.labels
-    if found is None:
+    world_from_body = rotations.inverse(paths.orientation)
+    shift = rotations.rotate(world_from_body[graph.source], graph.translation.double()).numpy()
+    forest = paths.forest
+    child = np.flatnonzero(paths.hangs_on_odometry)
+    by = forest.parent_edge[child]
+    if not np.isfinite(shift[by]).all():
         return None
-    labels = KeptLabels.of_arrays(graph, found.of_edges(others, graph.num_edges))
-    labels = replace(labels, search=np.array([int((~graph.is_odometry).sum()), 0.0, 0.0]))
-    networks = run.networks.load(SlamCleanNet), run.networks.load(SlamFineNet)
-    with run.watch.stage("links"):
-        solved = SlamMemory.of_labels(labels, graph, networks, first.body_from_world, np.zeros(0, dtype=np.int64))
-        estimate, after = solved.estimate, solved.estimate.memory
-        assert isinstance(after, SlamMemory)
-        if labels.by_places:
-            estimate = with_poses(graph, estimate, poses_of_kept(after.calibrated(graph), solved.mode, labels))
-            after = estimate.memory
-            assert isinstance(after, SlamMemory)
-    changed = (after.trusted[others] > _GOOD) != (memory.trusted > _GOOD)
-    rejected = after.trusted[links] <= _GOOD
-    if len(solved.mode.slipped) or max(changed.mean(), rejected.mean()) > _CONTRADICTING:
-        return None
-    return replace(estimate, warnings=first.warnings)
+    step = np.zeros((graph.num_nodes, 3))
+    step[child] = np.where((graph.target.numpy()[by] == child)[:, None], shift[by], -shift[by])
+    position = np.stack([accumulate_to_root(forest, column) for column in step.T], axis=1)
+    between = position[graph.target.numpy()[edge]] - position[graph.source.numpy()[edge]]
+    return np.asarray(((shift[edge] - between) ** 2).sum(axis=1))

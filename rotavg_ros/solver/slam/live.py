@@ -25,6 +25,7 @@ from rotavg_ros.solver.running.work import metered
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
+from rotavg_ros.solver.slam.links import with_links, with_more_links
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.poses.solve import has_places, poses_of_kept, poses_of_labels, poses_of_update
@@ -77,7 +78,7 @@ def update_slam(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | No
             return None
         known = _searched_ahead(graph, known, run)
     with run.watch.stage("update"):
-        return _laid_on(graph, known, math.inf if run.work is None else run.work)
+        return _laid_on(known.seen(graph), known, math.inf if run.work is None else run.work)
 
 
 def resume_slam(graph: ViewGraph, labels: KeptLabels, run: Run) -> Estimate | None:
@@ -92,13 +93,14 @@ def resume_slam(graph: ViewGraph, labels: KeptLabels, run: Run) -> Estimate | No
     if not is_known or not begins_with(graph, labels.graph, len(labels.trusted)):
         return None
     with run.watch.stage("update"):
+        graph, links = with_links(graph)
         start = run.warm_start.double()
         joints = _joints(graph, labels.are_known(graph.num_edges))
         found = SlamMemory.of_labels(labels, graph, _networks(run), start, _far_from(graph, joints, start))
         estimate, memory = found.estimate, found.estimate.memory
         assert isinstance(memory, SlamMemory)
-        if len(joints):
-            estimate = replace(estimate, memory=memory.with_all_unexplained())
+        memory = replace(memory, links=links)
+        estimate = replace(estimate, memory=memory.with_all_unexplained() if len(joints) else memory)
         if labels.by_places:
             estimate = with_poses(graph, estimate, poses_of_kept(memory.calibrated(graph), found.mode, labels))
     return replace(estimate, warnings=memory.notes, is_anew=False)
@@ -141,7 +143,7 @@ def _searched_ahead(graph: ViewGraph, known: SlamMemory, run: Run) -> SlamMemory
 
 def _going_on_from(found: SlamMemory, graph: ViewGraph, known: SlamMemory, run: Run) -> SlamMemory:
     """The memory after a whole search; closures that came meanwhile count as before until an update includes them."""
-    found = replace(found, update_work=known.update_work)
+    found, graph = replace(found, update_work=known.update_work), found.seen(graph)
     if _num_new_closures(graph, found) == 0:
         return found
     searched = replace(known, searched=found.searched, is_divided=found.is_divided, unexplained=0)
@@ -164,8 +166,10 @@ def _caught_up(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | N
     An update that is not expected to end within the work is not begun before the answer; it runs afterwards.
     """
     known, ration = memory, math.inf if run.work is None else run.work
+    stated = graph
     with metered() as meter:
         while True:
+            graph = known.seen(stated)
             if not known.is_grown_to(graph):
                 return None
             update = known.update
@@ -183,7 +187,7 @@ def _caught_up(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | N
             if (after := update.result) is None:
                 return None
             if after.columns is None:
-                after = replace(after, update_work=update.spent)
+                after, graph = replace(after, update_work=update.spent), after.seen(stated)
                 if _num_new_closures(graph, after) > _most_columns(_linear(after), left):
                     update = Resumable(partial(_with_columns, graph, after))
                     return replace(known, update=update, update_work=after.update_work)
@@ -195,6 +199,9 @@ def _thinned_out(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory |
 
     There is no answer to fall back on, so this solve is not suspended.
     """
+    links = memory.links
+    if len(links):
+        graph, links = with_links(graph)
     before = memory.thinned_to(graph)
     if before is None or run.warm_start is None or (memory.poses is None) is has_places(graph):
         return None
@@ -203,7 +210,7 @@ def _thinned_out(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory |
     if memory.poses is not None:
         estimate = with_poses(graph, estimate, poses_of_labels(before.calibrated(graph), found.mode))
     assert isinstance(estimate.memory, SlamMemory)
-    return estimate.memory
+    return replace(estimate.memory, links=links)
 
 
 def _networks(run: Run) -> tuple[SlamCleanNet, SlamFineNet]:
@@ -211,14 +218,17 @@ def _networks(run: Run) -> tuple[SlamCleanNet, SlamFineNet]:
 
 
 def _growth(graph: ViewGraph, known: SlamMemory, since: ViewGraph | Linear) -> Growth | None:
-    """How nodes newer than ``since`` are attached to older ones by odometry; None if they are not."""
+    """How nodes newer than ``since`` are attached to older ones; None if some are not, or odometry does more."""
     new = np.arange(since.num_edges, graph.num_edges)
-    return Growth.of(known.calibrated(graph), new[graph.is_odometry[new].numpy()], since.num_nodes)
+    new = new[graph.is_odometry[new].numpy()]
+    growth = Growth.of(known.calibrated(graph), new, since.num_nodes)
+    return growth if growth is not None and len(growth.edge) == len(new) else None
 
 
 def _updated(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | None:
     """The memory after a solve from the previous labelling, with new closures judged; None if it cannot be made."""
     assert run.warm_start is not None
+    graph, links = with_more_links(graph, memory.links, memory.graph.num_edges)
     before = memory.poses
     calibrated = memory.calibrated(graph)
     start = run.warm_start.double() if before is None else before.start_alone(calibrated)
@@ -232,7 +242,7 @@ def _updated(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | Non
             return None
         estimate = with_poses(graph, estimate, poses)
     assert isinstance(estimate.memory, SlamMemory)
-    return estimate.memory.since(memory, estimate.outlier_score)
+    return replace(estimate.memory, links=links).since(memory, estimate.outlier_score)
 
 
 def _laid_on(graph: ViewGraph, known: SlamMemory, ration: float) -> Estimate | None:

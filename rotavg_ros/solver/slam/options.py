@@ -14,6 +14,7 @@ SWITCHES: dict[str, str] = {
     "near-misses": "the rotations of false closures are uniform over all rotations",
     "vertical": "false closures of a robot that stays upright are wrong by any turn, not only about the vertical",
     "restated": "closures over a few keyframes are measurements, though they do not see odometry's errors",
+    "links": "closures over a few keyframes err as other closures do, not as odometry does",
     "repeats": "the errors of false closures are independent",
     "own-repeats": "false closures repeat each other's turns equally often in all runs",
     "label-runs": "closures that follow each other have independent labels",

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, minimum_spanning_forest
+from rotavg_ros.solver.algebra.spanning_forest import SpanningForest
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs, agreement_pairs
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract
-from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths, odometry_ends
+from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths, odometry_forest
 from rotavg_ros.solver.slam.noise.gyro_bias import estimate_bias, without_bias
 from rotavg_ros.solver.slam.noise.model import (
     NoiseModel,
@@ -23,10 +22,8 @@ from rotavg_ros.solver.slam.noise.model import (
     noise_between_neighbours,
 )
 from rotavg_ros.solver.slam.noise.restated_odometry import restated_odometry
-from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+from rotavg_ros.view_graph import ViewGraph
 
-# Cost of a closure in the forest: larger than that of any number of odometry steps.
-_CLOSURE_COST = 1e6
 # Odometry may be biased if this share of the closures disagrees with it; it counts as biased if removing the bias lets
 # that many fewer disagree, with less drift.
 _BIASED_SHARE = 0.5
@@ -124,7 +121,7 @@ def _may_be_biased(prepared: Prepared) -> bool:
 
 def made_of_odometry(graph: ViewGraph) -> np.ndarray:
     """``(M,)`` bool, closures that a graph as it was measured shows to be made of odometry."""
-    return restated_odometry(graph, OdometryPaths.along(graph, _along_odometry(graph)))
+    return restated_odometry(graph, OdometryPaths.along(graph, odometry_forest(graph)))
 
 
 def contract_odometry(graph: ViewGraph, restated: np.ndarray | None = None) -> tuple[ClosureGraph, SpanningForest]:
@@ -136,14 +133,6 @@ def contract_odometry(graph: ViewGraph, restated: np.ndarray | None = None) -> t
             graph whose systematic errors have not been removed.
     """
     spend(_EDGE * graph.num_edges)
-    forest = _along_odometry(graph)
+    forest = odometry_forest(graph)
     paths = OdometryPaths.along(graph, forest)
     return contract(graph, paths, restated_odometry(graph, paths) if restated is None else restated), forest
-
-
-def _along_odometry(graph: ViewGraph) -> SpanningForest:
-    """The forest that prefers odometry."""
-    usable = graph.label != EdgeLabel.REJECTED
-    cost = torch.where(graph.is_odometry, 1.0, _CLOSURE_COST)
-    # A rejected edge may only be used where nothing else connects.
-    return minimum_spanning_forest(graph, torch.where(usable, cost, _CLOSURE_COST**2), is_root=odometry_ends(graph))

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +17,7 @@ from rotavg_ros.solver.slam import stages as slam_stages
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.fine_net.tuning import fine_tuned
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each, without_repeats
-from rotavg_ros.solver.slam.links import links_of, solved_in_two_parts
+from rotavg_ros.solver.slam.links import with_links
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.calibration import calibrated
 from rotavg_ros.solver.slam.options import SlamStages
@@ -78,16 +79,14 @@ def whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     The graph is contracted and cleaned again for each candidate of a systematic error.
     """
     with metered() as meter:
-        links = links_of(graph) if stages == SlamStages() else None
-        estimate = None
-        if links is not None:
-            estimate = solved_in_two_parts(graph, links, lambda reduced: _whole(reduced, stages, run), run)
-        if estimate is None:
-            estimate = _whole(graph, stages, run)
+        links = np.zeros(0, dtype=np.int64)
+        if "links" not in stages.without:
+            graph, links = with_links(graph)
+        estimate = _whole(graph, stages, run)
     memory = estimate.memory
     if not isinstance(memory, SlamMemory):
         return estimate
-    return replace(estimate, memory=replace(memory, update_work=_UPDATE * meter.spent))
+    return replace(estimate, memory=replace(memory, links=links, update_work=_UPDATE * meter.spent))
 
 
 def _whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:

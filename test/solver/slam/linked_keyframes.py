@@ -59,9 +59,10 @@ def linked(
     source = np.concatenate([np.arange(count - span) for span in spans])
     target = np.concatenate([np.arange(span, count) for span in spans])
     turn = orientation[source].inv() * orientation[target]
-    turn = turn * Rotation.from_rotvec(np.radians(own_deg) * rng.normal(size=(len(source), 3)))
+    axes = np.array([0.0, 0.0, 1.0]) if case.planar else np.ones(3)
+    turn = turn * Rotation.from_rotvec(np.radians(own_deg) * axes * rng.normal(size=(len(source), 3)))
     shift = orientation[source].inv().apply(position[target] - position[source])
-    shift += 0.05 * own_deg * rng.normal(size=shift.shape)
+    shift += 0.05 * own_deg * (1 - axes if case.planar else axes) * rng.normal(size=shift.shape)
     more = ViewGraph.create(
         source, target, source_from_target=turn.as_quat(), translation=shift, num_nodes=graph.num_nodes
     )

@@ -108,6 +108,11 @@ class ClosureGraph:
         return out
 
     @property
+    def is_beside(self) -> np.ndarray:
+        """``(E,)`` bool, odometry beside the chain."""
+        return np.asarray(self.is_odometry & (np.arange(len(self.source)) >= self.num_segments))
+
+    @property
     def is_closure(self) -> np.ndarray:
         return ~self.is_odometry
 

@@ -19,7 +19,10 @@ from rotavg_ros.solver.algebra.spanning_forest import (
     compose_orientations,
     minimum_spanning_forest,
 )
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+
+# Cost of a closure in the forest: larger than that of any number of odometry steps.
+_CLOSURE_COST = 1e9
 
 
 @dataclass(frozen=True)
@@ -82,16 +85,39 @@ def runs_forward(graph: ViewGraph) -> np.ndarray:
     """``(M,)`` bool, whether edges run from the older to the newer end by odometry; for closures, by node numbers."""
     source, target = graph.source.numpy(), graph.target.numpy()
     by_number = source < target
-    steps = graph.is_odometry.numpy()
-    ends = np.stack((source[steps], target[steps]))
-    is_monotonic = all(np.bincount(end, minlength=1).max() <= 1 for end in (ends.min(axis=0), ends.max(axis=0)))
-    if is_monotonic:
+    if _is_chain(graph):
         return by_number
+    steps = graph.is_odometry.numpy()
     odometry = graph.select_edges(graph.is_odometry)
-    forest = minimum_spanning_forest(odometry, torch.ones(odometry.num_edges), is_root=odometry_ends(odometry))
+    forest = minimum_spanning_forest(odometry, odometry.steps, is_root=odometry_ends(odometry))
     position = OdometryPaths.along(odometry, forest).position
     is_told = steps & (position[source] != position[target])
     return np.where(is_told, position[source] < position[target], by_number)
+
+
+def odometry_forest(graph: ViewGraph) -> SpanningForest:
+    """The forest along which odometry is contracted; of several edges between keyframes, those of fewest steps."""
+    usable = graph.label != EdgeLabel.REJECTED
+    cost = torch.where(graph.is_odometry, graph.steps, _CLOSURE_COST)
+    # A rejected edge may only be used where nothing else connects.
+    return minimum_spanning_forest(graph, torch.where(usable, cost, _CLOSURE_COST**2), is_root=odometry_ends(graph))
+
+
+def beside_the_chain(graph: ViewGraph) -> np.ndarray:
+    """``(M,)`` bool, odometry outside of that forest."""
+    beside = graph.is_odometry.numpy().copy()
+    if not _is_chain(graph):
+        parent_edge = odometry_forest(graph).parent_edge
+        beside[parent_edge[parent_edge >= 0]] = False
+        return np.asarray(beside)
+    return np.zeros(graph.num_edges, dtype=bool)
+
+
+def _is_chain(graph: ViewGraph) -> bool:
+    """Whether odometry leads from no node to two later ones, nor from two to one."""
+    steps = graph.is_odometry
+    ends = torch.stack((graph.source[steps], graph.target[steps])).numpy()
+    return all(np.bincount(end, minlength=1).max() <= 1 for end in (ends.min(axis=0), ends.max(axis=0)))
 
 
 def odometry_ends(graph: ViewGraph) -> np.ndarray:
@@ -103,10 +129,10 @@ def odometry_ends(graph: ViewGraph) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Growth:
-    """n new nodes, each attached to an older one by one odometry edge.
+    """n new nodes, each attached to an older one by odometry.
 
     Attributes:
-        edge: ``(n,)`` that edge, in the order of the nodes.
+        edge: ``(n,)`` the edge that attaches each, in the order of the nodes.
         parent: ``(n,)`` its other end.
         anchor: ``(n,)`` the known node at which the way back ends.
         turn: ``(n, 4)`` orientation relative to the anchor: body_from_world if the anchor's is the identity.
@@ -120,10 +146,13 @@ class Growth:
 
     @classmethod
     def of(cls, graph: ViewGraph, edge: np.ndarray, num_known: int) -> Growth | None:
-        """From new odometry edges ``(n,)``; None if nodes from ``num_known`` on are not attached one by one."""
+        """From new odometry ``(m,)``; None if it does not attach all nodes from ``num_known`` on to older ones."""
         source, target = graph.source.numpy()[edge], graph.target.numpy()[edge]
         child, parent = np.maximum(source, target), np.minimum(source, target)
-        order = np.argsort(child)
+        # Of several edges to a node, that of fewest steps, as in the forest.
+        order = np.lexsort((edge, graph.steps.numpy()[edge], child))
+        order = order[np.unique(child[order], return_index=True)[1]]
+        order = order[child[order] >= num_known]
         child, parent, edge = child[order], parent[order], edge[order]
         if not np.array_equal(child, np.arange(num_known, graph.num_nodes)):
             return None

@@ -20,7 +20,7 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
-from rotavg_ros.solver.slam.graph.odometry_paths import runs_forward
+from rotavg_ros.solver.slam.graph.odometry_paths import beside_the_chain, runs_forward
 from rotavg_ros.solver.slam.graph.routes import routes_of
 from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
 from rotavg_ros.solver.slam.noise.model import NoiseModel
@@ -117,23 +117,27 @@ def _squared_angles(design: np.ndarray, measured: np.ndarray, biases: np.ndarray
 def without_bias(graph: ViewGraph, bias: np.ndarray) -> ViewGraph:
     """The graph with ``bias`` ``(3,)`` rad per step taken out of its odometry, whichever way an edge runs.
 
+    Odometry beside the chain was measured otherwise, and has not this bias.
+
     Translations stay the same in the frame of the older end. Those of several steps change, since later steps follow
     the turns of earlier ones.
     """
     is_forward = torch.from_numpy(runs_forward(graph))[:, None]
     by_bias, shift = graph.steps[:, None] * torch.from_numpy(bias), torch.zeros((graph.num_edges, 3)).double()
-    several = np.flatnonzero((graph.is_odometry & (graph.steps > 1)).numpy())
+    on_chain = graph.is_odometry & torch.from_numpy(~beside_the_chain(graph))
+    several = np.flatnonzero((on_chain & (graph.steps > 1)).numpy())
     if len(several):
         older = torch.where(is_forward[:, 0], graph.source, graph.target).numpy()[several]
         of_several = routes_of(graph, several, older)
         by_bias[several], shift[several] = (
             torch.from_numpy(matrix @ bias) for matrix in (of_several.by_bias, of_several.shift_by_bias)
         )
+    by_bias = torch.where(on_chain[:, None], by_bias, 0.0)
     turn = rotations.exp(-by_bias)
     measured = graph.target_from_source
     forwards = rotations.multiply(measured, turn)
     backwards = rotations.multiply(rotations.inverse(turn), measured)
-    corrected = torch.where(graph.is_odometry[:, None], torch.where(is_forward, forwards, backwards), measured)
+    corrected = torch.where(on_chain[:, None], torch.where(is_forward, forwards, backwards), measured)
     unbiased = replace(graph, target_from_source=rotations.canonical(rotations.normalize(corrected)))
     if graph.routes is not None:
         onwards = torch.where(is_forward, measured, rotations.inverse(measured))
@@ -143,7 +147,7 @@ def without_bias(graph: ViewGraph, bias: np.ndarray) -> ViewGraph:
     by_older = torch.where(is_forward, graph.translation, rotations.rotate(measured, graph.translation))
     by_older = by_older + torch.where(is_forward, shift, -shift)
     seen = torch.where(is_forward, by_older, rotations.rotate(rotations.inverse(corrected), by_older))
-    return replace(unbiased, translation=torch.where(graph.is_odometry[:, None], seen, graph.translation))
+    return replace(unbiased, translation=torch.where(on_chain[:, None], seen, graph.translation))
 
 
 def _turning_less(graph: ViewGraph, onwards: torch.Tensor, by_bias: torch.Tensor) -> torch.Tensor:

@@ -14,10 +14,12 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from scipy.special import gammaincinv
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths
+from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.noise.mixture import Discrepancies
 from rotavg_ros.solver.slam.noise.model import likeliest_by_chain
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
@@ -30,6 +32,8 @@ _BANDS = (0.0, 4.0, 8.0, 16.0, LOOP_STEPS)
 _SEEN, _UNLIKELY, _SIGMAS = 0.25, 0.001, 3.0
 # Edges are compared with so many others that begin next; fewer pairs than this say nothing.
 _NEXT, _FEW = 4, 30
+# … and those that contradict odometry with so many others of them.
+_BESIDE = 8
 # Nats by which loop closures must show that some of them are good.
 _EVIDENCE = 5.0
 # Number of standard deviations of its kind at which an edge is none of it, and the rounding error of a file's six
@@ -59,12 +63,48 @@ def restated_odometry(graph: ViewGraph, paths: OdometryPaths) -> np.ndarray:
     # Of good loop closures this is more than odometry's variance: the larger part of them need not be good.
     if min(bounds) > _SEEN * float(np.median(square[is_loop] / steps[is_loop])) / _quantile(0.5, k):
         return restated
+    if any(seen.a_slip(band, k) for band in bands):
+        return restated
+    if _is_bias(graph, paths, chosen, seen):
+        return restated
     loops = Discrepancies(square[is_loop], steps[is_loop], 1, 1.0)
     noise, evidence = likeliest_by_chain(loops, k)
     for band, most in zip(bands, bounds, strict=True):
         if evidence > _EVIDENCE and most <= _SEEN * noise.step_variance:
-            restated[edge[band[square[band] <= _FARTHEST**2 * k * _usual(square[band], k)]]] = True
+            restated[edge[band[is_of_its_kind(square[band], k)]]] = True
     return restated
+
+
+def is_of_its_kind(square: np.ndarray, components: int) -> np.ndarray:
+    """``(n,)`` bool, which squared discrepancies are no larger than is usual among them; NaN is not."""
+    return np.asarray(square <= _FARTHEST**2 * components * _usual(square, components))
+
+
+def _is_bias(graph: ViewGraph, paths: OdometryPaths, chosen: np.ndarray, seen: _Seen) -> bool:
+    """Whether closures over a few steps say that odometry turns too far at every step alike, and loops confirm it.
+
+    What is made of odometry has its bias, and does not see it.
+
+    Args:
+        graph: as it was measured.
+        paths: its paths.
+        chosen: ``(F,)`` bool, closures.
+        seen: what they see.
+    """
+    steps = paths.path_steps[chosen]
+    short, is_loop = np.flatnonzero(steps <= LOOP_STEPS), steps > LOOP_STEPS
+    ends = torch.stack((graph.source, graph.target))[:, paths.outside[chosen][short]]
+    older = torch.where(torch.from_numpy(paths.position)[ends].argmin(dim=0).bool(), ends[1], ends[0])
+    turned = rotations.rotate(paths.orientation[older], torch.from_numpy(seen.off[short])).numpy()
+    rate = -turned / steps[short, None]
+    rate = rate[is_of_its_kind((rate**2).sum(axis=1), graph.rotation_components)]
+    bias, spread = rate.mean(axis=0), rate.var(axis=0).sum()
+    if (bias**2).sum() * len(rate) <= spread * _quantile(1 - _UNLIKELY, graph.rotation_components):
+        return False
+    corrected = OdometryPaths.along(without_bias(graph, bias), paths.forest)
+    square = [(rotations.log(each.residual[torch.from_numpy(chosen)]) ** 2).sum(dim=1) for each in (paths, corrected)]
+    before, after = (np.median(each.numpy()[is_loop] / steps[is_loop]) for each in square)
+    return bool(after < _SEEN * before)
 
 
 def _quantile(probability: float, freedom: int) -> float:
@@ -73,8 +113,9 @@ def _quantile(probability: float, freedom: int) -> float:
 
 
 def _usual(square: np.ndarray, components: int) -> float:
-    """rad² per component, variance of rotations with these squared angles if most of them are of one kind."""
-    return max(float(np.median(square)) / _quantile(0.5, components), _ROUNDING**2)
+    """Variance per component of vectors with these squared lengths if most of them are of one kind."""
+    known = square[np.isfinite(square)]
+    return max(float(np.median(known)) / _quantile(0.5, components), _ROUNDING**2) if len(known) else 0.0
 
 
 class _Seen(NamedTuple):
@@ -98,6 +139,23 @@ class _Seen(NamedTuple):
         ends = np.stack([position[each.numpy()[edge]] for each in (graph.source, graph.target)])
         off = rotations.log(paths.residual).numpy()[chosen]
         return cls(np.where((ends[0] > ends[1])[:, None], -off, off), ends.min(axis=0), ends.max(axis=0))
+
+    def a_slip(self, among: np.ndarray, components: int) -> bool:
+        """Whether two of these closures ``(m,)`` over a common step, with no end in common, contradict it alike.
+
+        Odometry slipped there. Where one is false by itself no other agrees with it.
+        """
+        square = (self.off[among] ** 2).sum(axis=1)
+        far = among[~is_of_its_kind(square, components)]
+        far = far[np.lexsort((self.last[far], self.first[far]))]
+        most = 2 * _FARTHEST**2 * components * _usual(square, components)
+        for ahead in range(1, min(_BESIDE, len(far) - 1) + 1):
+            one, other = far[:-ahead], far[ahead:]
+            overlaps = (self.first[one] < self.first[other]) & (self.first[other] < self.last[one])
+            alike = ((self.off[one] - self.off[other]) ** 2).sum(axis=1) <= most
+            if (overlaps & alike & (self.last[one] != self.last[other])).any():
+                return True
+        return False
 
     def most_variance(self, among: np.ndarray, components: int) -> float:
         """rad² a step: bound on the variance of odometry that these closures ``(m,)`` see; inf if there are none.

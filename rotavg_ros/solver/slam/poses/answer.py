@@ -149,6 +149,7 @@ def _precision(pose: PoseMode) -> np.ndarray:
     shift = noise.of_odometry(problem.travelled) + slipped * drawn.share_of_segment * slip
     if problem.jump is not None:
         shift += problem.jump
+    shift[drawn.view_graph_edge[problem.beside - drawn.num_segments]] *= noise.beside
     turn[edges] = mean_square[closure] / pose.solved.rotation_weight[closure, 0]
     shift[drawn.restated.edge] = np.inf
     back = pose.solved.closure_back

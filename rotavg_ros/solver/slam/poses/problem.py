@@ -42,7 +42,8 @@ class PoseProblem:
 
     Attributes:
         graph: the view-graph whose odometry was contracted, N nodes and M edges.
-        translation: ``(M, 3)`` position of the target in the source's frame, metres; NaN where unknown, of closures.
+        translation: ``(M, 3)`` position of the target in the source's frame, metres; NaN where unknown, of what
+            is not the chain.
         mode: the labelling by rotations alone.
         priors: of translations.
         jump: ``(M,)`` m² per component, variance of the jump of each edge of odometry; 0 where there is none. None:
@@ -63,6 +64,13 @@ class PoseProblem:
     def drawn(self) -> ClosureGraph:
         """The contracted graph, with nodes placed along segments in proportion to odometry's variance."""
         return self.mode.problem.drawn(self.mode.state.noise)
+
+    @cached_property
+    def beside(self) -> np.ndarray:
+        """``(B,)`` edges that are sound odometry beside the chain, and state translations."""
+        edge = self.mode.problem.beside[self.mode.state.is_good[self.mode.problem.beside]]
+        stated = self.translation[self.drawn.view_graph_edge[edge - self.drawn.num_segments]]
+        return np.asarray(edge[np.isfinite(stated).all(axis=1)])
 
     @cached_property
     def lengths(self) -> np.ndarray:

@@ -128,8 +128,10 @@ def shift_covariance(problem: PoseProblem, state: PoseState, way: Displacements)
     slipped = drawn.is_odometry & ~problem.mode.state.is_good
     variance += np.where(slipped, (problem.priors.slip * problem.typical) ** 2, 0.0)
     variance[:num_segments] += problem.jumps
-    # Rejected odometry beside the chain connects nothing else, so it does not pull.
-    variance[num_segments:] = np.where(slipped, variance / NOTHING, variance)[num_segments:]
+    # Odometry beside the chain that is rejected, or states no translation, connects nothing else, so it does not pull.
+    pulled = variance[problem.beside]
+    variance[num_segments:] /= NOTHING
+    variance[problem.beside] = noise.beside * pulled
     variance[problem.mode.problem.closure] = own_variance(problem, noise, problem.stated_square)
     covariance = variance[:, None, None] * unit
     bending = bridge_variance(problem, noise)[:, :, None, None] * bent(problem, way)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import torch
 
 from rotavg_ros.solver.running.kept_labels import KeptLabels
+from rotavg_ros.solver.slam.graph.odometry_paths import beside_the_chain
 from rotavg_ros.solver.slam.poses.answer import answer
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
@@ -22,13 +24,15 @@ _ABSURD = 1e100
 
 
 def has_places(graph: ViewGraph) -> bool:
-    """Whether translations of all odometry and some closures are known, and odometry moves at all."""
+    """Whether translations of the odometry chain and of some other edges are known, and odometry moves at all."""
     if graph.translation is None:
         return False
     known = (graph.translation.abs() < _ABSURD).all(dim=1)
-    odometry = graph.is_odometry
-    moves = bool(graph.translation[odometry].any())
-    return moves and bool(known[odometry].all()) and bool(known[~odometry].any())
+    chain = graph.is_odometry
+    if not known[chain].all() or not known[~chain].any():
+        chain = chain & torch.from_numpy(~beside_the_chain(graph))
+    moves = bool(graph.translation[chain].any())
+    return moves and bool(known[chain].all()) and bool(known[~chain].any())
 
 
 def median_poses(
@@ -41,6 +45,8 @@ def median_poses(
         modes: labellings of its rotations, the likeliest first.
         tuned: function that sets each edge's noise in a labelling by FineNet.
     """
+    if len(modes[0].problem.closure) == 0:
+        return poses_of_labels(graph, tuned(modes[0])), modes[0]
     rivals = rival_poses(graph, _translations(graph), modes, tuned)
     poses, middle = answer(rivals.poses, rivals.share)
     return PoseMemory.of(rivals.poses[middle], poses), rivals.modes[middle]

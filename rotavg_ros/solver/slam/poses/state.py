@@ -21,6 +21,7 @@ class PoseNoise:
         step: m² per step of odometry, however long: scans are matched as well from far as from near.
         tilt: rad², of one step of odometry about any other axis, which gravity may hold. Equal to ``turn`` where no
             vertical is known.
+        beside: variance of the shifts of odometry beside the chain, relative to the chain's.
     """
 
     turn: float
@@ -31,15 +32,16 @@ class PoseNoise:
     common: float
     step: float
     tilt: float
+    beside: float = 1.0
 
     @property
     def logarithms(self) -> np.ndarray:
-        """``(8,)``."""
+        """``(9,)``."""
         return np.log(astuple(self))
 
     @classmethod
     def of(cls, logarithms: np.ndarray) -> PoseNoise:
-        """From ``(8,)``."""
+        """From ``(9,)``."""
         return cls(*np.exp(logarithms).tolist())
 
     def of_odometry(self, travelled: np.ndarray) -> np.ndarray:

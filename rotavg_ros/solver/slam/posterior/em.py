@@ -156,17 +156,22 @@ def estimate_noise(problem: Problem, state: State, factorised: Factorised) -> No
     redundancy = k * np.concatenate((state.trusted * site.shrinkage, of_runs))
     square = np.concatenate((state.trusted * site.misfit, (residual[num_edges:] ** 2).sum(axis=1) / common))
     is_step = np.concatenate((problem.graph.is_odometry, np.zeros(len(common), dtype=bool)))
+    is_other = ~is_step
+    is_step[problem.beside] = False
 
-    def likeliest(rows: np.ndarray, before: float, prior_deg: float) -> float:
+    def likeliest(rows: np.ndarray, before: float, median: float) -> float:
         squares, freedom = before * float(square[rows].sum()), float(redundancy[rows].sum())
-        return likeliest_variance(
-            squares, freedom, np.log(before), 2 * np.log(np.radians(prior_deg)), priors.noise_spread
-        )
+        return likeliest_variance(squares, freedom, np.log(before), np.log(median), priors.noise_spread)
 
+    step = likeliest(is_step, noise.step_variance, np.radians(priors.step_deg) ** 2)
+    beside = 1.0
+    if len(problem.beside):
+        beside = likeliest(problem.beside, noise.beside * noise.step_variance, step) / step
     return replace(
         noise,
-        step_variance=likeliest(is_step, noise.step_variance, priors.step_deg),
-        closure_variance=likeliest(~is_step, noise.closure_variance, priors.closure_deg),
+        step_variance=step,
+        closure_variance=likeliest(is_other, noise.closure_variance, np.radians(priors.closure_deg) ** 2),
+        beside=beside,
         step_told=_step_told(problem, state, factorised.weight, residual),
     )
 
@@ -233,4 +238,5 @@ def _gained(problem: Problem, before: Noise, after: Noise) -> float:
     """Approximate decrease of F, nats: n components determine their log variance with a precision of ½ n."""
     steps = np.log(after.step_variance / before.step_variance) ** 2 * problem.graph.num_segments
     closures = np.log(after.closure_variance / before.closure_variance) ** 2 * len(problem.closure)
-    return float(problem.components / 4 * (steps + closures))
+    beside = np.log(after.beside / before.beside) ** 2 * len(problem.beside)
+    return float(problem.components / 4 * (steps + closures + beside))

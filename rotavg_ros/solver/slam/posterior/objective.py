@@ -123,4 +123,6 @@ def log_noise_prior(noise: Noise, priors: SlamPriors) -> float:
     some = priors.tails / (len(TAIL_SHARES) - 1)
     tailed = np.log(some if noise.closure_tails > 0 else 1 - priors.tails)
     tailed += np.log(some / len(STEP_TAIL_RATIOS) if noise.step_tails > 0 else 1 - priors.tails)
-    return float(believed + common + turns + tailed - (step**2 + closure**2) / (2 * priors.noise_spread**2))
+    beside = np.log(noise.beside) / 2
+    squares = step**2 + closure**2 + beside**2
+    return float(believed + common + turns + tailed - squares / (2 * priors.noise_spread**2))

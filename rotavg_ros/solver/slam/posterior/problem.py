@@ -115,6 +115,11 @@ class Problem:
         return np.flatnonzero(self.graph.is_closure)
 
     @cached_property
+    def beside(self) -> np.ndarray:
+        """``(B,)`` edges that are odometry beside the chain."""
+        return np.flatnonzero(self.graph.is_beside)
+
+    @cached_property
     def sign(self) -> np.ndarray:
         """``(C,)`` +1 where a closure runs from its older to its newer end, else −1."""
         return np.asarray(np.where(self.graph.is_forward, 1.0, -1.0)[self.closure])

@@ -30,6 +30,7 @@ def variances(problem: Problem, noise: Noise) -> np.ndarray:
     graph, system = problem.graph, problem.system(noise)
     steps = graph.own_steps + noise.turn_share * (problem.turn_steps - graph.own_steps)
     variance = steps * noise.step_variance
+    variance[problem.beside] *= noise.beside
     closure = problem.closure
     own = np.where(system.shared[closure], 1 - noise.common_share, 1.0)
     variance[closure] = own * np.exp(noise.exponent * problem.stated_ratio) * noise.closure_variance

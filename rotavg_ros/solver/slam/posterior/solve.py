@@ -273,7 +273,8 @@ def _travelled(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:
     if graph.translation is None:
         return None
     length = torch.from_numpy(ways_passed(graph.translation.double().numpy(), way_along(graph)))
-    if not bool(torch.isfinite(length[graph.is_odometry]).all()):
+    chain = prepared.forest.parent_edge[prepared.forest.parent_edge >= 0]
+    if not bool(torch.isfinite(length[chain])[graph.is_odometry[chain]].all()):
         return None
     return _from_root(torch.where(graph.is_odometry, length, 0.0), prepared)
 

@@ -33,6 +33,7 @@ class Noise:
         step_tails, closure_tails: share of sound segments, and of good closures, that err by far more than others.
         step_tail_ratio: τ, variance of these segments relative to the others.
         step_told: φ, k_eff / k of odometry, 1 where it errs alike about all axes (estimated with the variances).
+        beside: variance of odometry beside the chain, relative to the chain's over as many steps (likewise).
         run_steps: largest length of a run at its older end, in steps of odometry; 0 where closures err independently.
     """
 
@@ -46,17 +47,18 @@ class Noise:
     closure_tails: float = TAIL_SHARES[0]
     step_tail_ratio: float = STEP_TAIL_RATIOS[0]
     step_told: float = 1.0
+    beside: float = 1.0
 
     @property
     def is_possible(self) -> bool:
         """Whether the values are valid, for noise read from a file."""
-        variances = self.step_variance, self.closure_variance, self.step_tail_ratio, self.step_told
+        variances = self.step_variance, self.closure_variance, self.step_tail_ratio, self.step_told, self.beside
         shares = self.common_share, self.turn_share, self.step_tails, self.closure_tails
         return min(variances) > 0 and max(shares) < 1
 
     def chosen_as(self, other: Noise) -> Noise:
         """The own values that are estimated from residuals, with another noise's values that are chosen from grids."""
-        told = {name: getattr(self, name) for name in ("step_variance", "closure_variance", "step_told")}
+        told = {name: getattr(self, name) for name in ("step_variance", "closure_variance", "step_told", "beside")}
         return replace(other, **told)
 
     @property

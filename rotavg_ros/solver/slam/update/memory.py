@@ -7,7 +7,7 @@ only make it likelier. New odometry without closures gives no evidence about old
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from rotavg_ros.solver.running.resumable import Resumable
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each, repeats_since
+from rotavg_ros.solver.slam.links import as_closures, as_odometry
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.calibration import Calibration, calibrated
 from rotavg_ros.solver.slam.poses.memory import PoseMemory
@@ -73,6 +74,7 @@ class SlamMemory:
         update: the solve with new closures, if one is under way.
         update_work: units that the last update took.
         columns: columns of new closures, until the update has ended.
+        links: ``(n,)`` edges that are odometry in ``graph``, but closures to the caller.
     """
 
     graph: ViewGraph
@@ -94,6 +96,7 @@ class SlamMemory:
     update: Resumable[SlamMemory | None] | None = None
     update_work: float = 0.0
     columns: Columns | None = None
+    links: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @classmethod
     def of(
@@ -161,7 +164,8 @@ class SlamMemory:
         # A search that is due or under way is due for whoever continues from the labels.
         unexplained = self.unexplained if self.ahead is None else self.with_all_unexplained().unexplained
         search = np.array([self.searched, unexplained, self.is_divided], dtype=np.float64)
-        return KeptLabels(self.graph, self.trusted, np.array(astuple(self.noise)), calibration, places, noise, search)
+        graph = as_closures(self.graph, self.links)
+        return KeptLabels(graph, self.trusted, np.array(astuple(self.noise)), calibration, places, noise, search)
 
     @property
     def is_due(self) -> bool:
@@ -191,10 +195,17 @@ class SlamMemory:
             return self
         known = before.graph.num_edges
         is_closure = ~self.graph.is_odometry
+        is_closure[self.links] = True
         flagged = int((score > _FLAGGED)[known:][is_closure[known:]].sum())
         changed = (self.trusted[:known] > _GOOD) != (before.trusted > _GOOD)
         turned = int(changed[is_closure[:known].numpy()].sum())
         return replace(self, unexplained=before.unexplained + flagged + turned)
+
+    def seen(self, graph: ViewGraph) -> ViewGraph:
+        """The caller's graph, with the links that this memory knows as odometry."""
+        if len(self.links) == 0 or graph.num_edges < self.graph.num_edges:
+            return graph
+        return as_odometry(graph, self.links, self.graph.steps.numpy()[self.links])
 
     def is_grown_to(self, graph: ViewGraph) -> bool:
         """Whether ``graph`` has grown from this memory's graph, by edges that repeat no measurement."""

@@ -164,7 +164,9 @@ def test_nodes_that_hang_otherwise_do_not_grow() -> None:
     graph = _slam_graph(21, 0, 2)
     assert Growth.of(graph, np.array([19]), 20) is not None
     assert Growth.of(graph, np.array([19]), 19) is None  # a node has no edge
-    assert Growth.of(graph, np.array([18, 19]), 20) is None  # another way along odometry
+    beside = Growth.of(graph, np.array([18, 19]), 20)  # another way along odometry attaches nothing
+    assert beside is not None
+    assert beside.edge.tolist() == [19]
 
 
 @given(st.lists(st.integers(1, 30), min_size=1, max_size=4), st.booleans(), st.integers(0, 10**6))

@@ -17,7 +17,7 @@ _SLOWEST, HELD = 16.0, 8
 # Number of solves after which it is checked whether places end as those of other poses.
 _ALIKE_AFTER = 4
 # Variances that are not held: those of closures' shifts.
-_FREE = np.array([False, False, False, True, True, False, False, False])
+_FREE = np.array([False, False, False, True, True, False, False, False, False])
 # Bounds of the ratio of successive changes with which a variance is extrapolated to its limit; the ratio of an
 # alternating one is negative.
 _LEAST_RATIO, _LARGEST_RATIO = -2.0, 0.6
@@ -126,8 +126,8 @@ def with_noise(state: PoseState, noise: np.ndarray, last: np.ndarray, *, is_held
 
     Args:
         state: the state before.
-        noise: ``(8,)`` logarithms of the estimated variances.
-        last: ``(8,)`` previous changes; zero where these must not be extrapolated.
+        noise: ``(9,)`` logarithms of the estimated variances.
+        last: ``(9,)`` previous changes; zero where these must not be extrapolated.
         is_held: hold all variances but those of closures' shifts.
     """
     before = state.noise.logarithms

@@ -17,8 +17,10 @@ from rotavg_ros.solver.slam.poses.state import PoseNoise
 from rotavg_ros.solver.slam.posterior.em import likeliest_variance
 
 # Variances that are estimated each by itself; those of odometry's shifts, which are estimated together, and that which
-# grows with closures' lengths: by how many steps at most, and the change that ends them.
-_ALONE, _OF_SHIFTS, _GROWS = np.array([0, 1, 3, 5, 7]), np.array([2, 6]), [4]
+# grows with closures' lengths; the place of tilts among the first; by how many steps at most, and the change that ends
+# them.
+_ALONE, _OF_SHIFTS, _GROWS = np.array([0, 1, 3, 5, 7, 8]), np.array([2, 6]), [4]
+_TILT = 4
 _SCORING_STEPS, _SCORED = 20, 1e-3
 # Each variance's own prior: median and standard deviation of the logarithm of its root.
 _Prior = tuple[float, float]
@@ -51,8 +53,13 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     by_closures = np.stack((places.squares, places.freedom), axis=1)
     runs = slice(len(problem.drawn.source), None)
     alike = (solved.left[runs, k:] ** 2).sum(), np.trace(solved.factor.redundancy[runs, k:, k:], axis1=1, axis2=2).sum()
+    beside = problem.beside
+    own = (
+        (solved.left[beside, k:] ** 2).sum(),
+        np.trace(solved.factor.redundancy[beside, k:, k:], axis1=1, axis2=2).sum(),
+    )
     used, priors = np.exp(noise.logarithms), priors_of(problem, noise)
-    found = np.stack((by_turns, *by_closures, alike, by_tilts))
+    found = np.stack((by_turns, *by_closures, alike, by_tilts, own))
     found[:, 0] *= used[_ALONE]
 
     def likeliest(told: np.ndarray, number: int) -> float:
@@ -69,7 +76,7 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     noise = PoseNoise.of(logarithms)
     if problem.drift_axis is None or noise.tilt > noise.turn:
         # A larger variance of tilts is not allowed: it would make room for false closures.
-        alone = likeliest(found[0] + found[-1], 0)
+        alone = likeliest(found[0] + found[_TILT], 0)
         noise = replace(noise, turn=alone, tilt=alone)
     # Runs that join wrong places have a larger common error, and would otherwise raise the bound to fit themselves.
     most = problem.priors.most_common
@@ -160,4 +167,5 @@ def priors_of(problem: PoseProblem, noise: PoseNoise) -> tuple[_Prior, ...]:
         (float(np.log(noise.closure * of_shifts.common / (1 - of_shifts.common))), of_shifts.common_spread),
         (2 * float(np.log(of_shifts.still * typical)), of_shifts.still_spread),
         (float(np.log(noise.turn)), TILT_SPREAD),
+        (0.0, of_shifts.closure_spread),
     )

@@ -107,7 +107,7 @@ class PoseStart:
         Args:
             problem: the labelling, and translations.
             kept: ``(R, M)`` class probabilities and weights of the view-graph's first M edges; NaN where unknown.
-            noise: ``(8,)`` variances.
+            noise: ``(9,)`` variances.
         """
         if len(kept) != CLASSES + 2 or len(noise) != len(fields(PoseNoise)) or not (noise > 0).all():
             return None

@@ -47,7 +47,8 @@ def closure_rows(turn: np.ndarray, shift: np.ndarray, place: np.ndarray, covaria
         shift, place: ``(C, 3)`` metres.
         covariance: ``(C, d, d)`` of turns and shifts.
     """
-    return np.concatenate((turn.T, shift, place, covariance.reshape(len(shift), -1)), axis=1)
+    entries = covariance.shape[1] * covariance.shape[2]
+    return np.concatenate((turn.T, shift, place, covariance.reshape(len(shift), entries)), axis=1)
 
 
 @compiled
