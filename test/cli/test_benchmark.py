@@ -41,6 +41,7 @@ def test_hours_of_driving_with_a_limit(tmp_path: Path) -> None:
     assert float(last["error °"]) < 0.8 * float(last["odometry's °"])
 
 
+@pytest.mark.large
 def test_ticks_beside_isam2(tmp_path: Path) -> None:
     options = ["--ticks", "4", "--keyframes", "60", "--busy", "1"]
     assert main(["benchmark", *options, "--output", str(tmp_path)]) == 0

@@ -36,7 +36,11 @@ def _forget(traffic: Traffic) -> None:
 
 @pytest.mark.parametrize(
     ("method", "waits"),
-    [("neurora", 320), ("neurora-v2", 73), pytest.param("neurora-round", 321, marks=pytest.mark.large)],
+    [
+        pytest.param("neurora", 320, marks=pytest.mark.large),
+        ("neurora-v2", 73),
+        pytest.param("neurora-round", 321, marks=pytest.mark.large),
+    ],
 )
 def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> None:
     graph = _graph()

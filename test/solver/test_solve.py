@@ -253,6 +253,7 @@ def test_classic_graphs_with_thirty_percent_false_closures(shared_data: Path, na
     assert error < 0.15 * odometry_deg
 
 
+@pytest.mark.large
 def test_the_stated_uncertainty_is_that_of_repeated_runs() -> None:
     """Root mean square error over draws of the noise, against what each solve says of itself, inside segments too."""
     source, target, kind = slam_edges(300, 60, 3)

@@ -23,7 +23,14 @@ def test_every_recipe_and_size_is_drawn() -> None:
 
 
 @pytest.mark.parametrize(
-    "recipe", [ReleasedRecipe(cameras=(150, 250)), ReleasedRecipe(cameras=(150, 250), planar=False), PaperRecipe()]
+    "recipe",
+    [
+        ReleasedRecipe(cameras=(150, 250)),
+        *(
+            pytest.param(each, marks=pytest.mark.large)
+            for each in (ReleasedRecipe(cameras=(150, 250), planar=False), PaperRecipe())
+        ),
+    ],
 )
 def test_published_score_is_a_probability(recipe: ReleasedRecipe | PaperRecipe) -> None:
     rng = np.random.default_rng(3)

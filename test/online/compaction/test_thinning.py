@@ -193,6 +193,7 @@ def odometry_of(run: SimulatedRun) -> Iterator[tuple[int, list[float], np.ndarra
     return zip(run.stamps_ns.tolist(), run.odometry_world_from_body.tolist(), run.odometry_position, strict=True)
 
 
+@pytest.mark.large
 def test_a_long_drive_with_a_limit_is_hardly_less_accurate():
     config = SlamSimulationConfig(
         World.CITY, num_keyframes=800, laps=4, keyframe_distance_m=2.0, closures_per_keyframe=0.3, false_share=0.1

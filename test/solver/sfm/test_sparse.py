@@ -37,7 +37,9 @@ def error_deg(graph: ViewGraph, truth: Rotation, method: str) -> float:
     return float(torch.rad2deg(errors).mean())
 
 
-@pytest.mark.parametrize(("cameras", "reach", "false_share"), [(40, 4, 0.2), (100, 3, 0.05)])
+@pytest.mark.parametrize(
+    ("cameras", "reach", "false_share"), [(40, 4, 0.2), pytest.param(100, 3, 0.05, marks=pytest.mark.large)]
+)
 def test_it_is_no_worse_than_without_cleannet(cameras: int, reach: int, false_share: float) -> None:
     graphs = [ring(seed, cameras, reach, false_share) for seed in range(8)]
     ours, without = (

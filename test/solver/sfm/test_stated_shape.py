@@ -67,6 +67,7 @@ def _assert_same_flags(score: Tensor, expected: Tensor) -> None:
     assert torch.equal((score > 0.5)[is_clear], (expected > 0.5)[is_clear])
 
 
+@pytest.mark.large
 def test_true_information_helps_more_than_its_size_alone() -> None:
     errors = {"full": [], "scalar": [], "none": []}  # type: dict[str, list[float]]
     for seed in range(1000, 1004):

@@ -70,7 +70,7 @@ def test_what_hardly_joins_two_well_knit_parts_counts(score: float) -> None:
     assert np.allclose(ratio[59:], 1, atol=0.3)
 
 
-@pytest.mark.parametrize("name", _GRAPHS)
+@pytest.mark.parametrize("name", [pytest.param("street", marks=pytest.mark.large), "well knit"])
 def test_errors_over_draws_of_the_noise_are_as_stated(name: str) -> None:
     source, target = _GRAPHS[name]
     truth = random_truth(60, 5)

@@ -70,7 +70,13 @@ def test_neither_names_nor_axes_nor_directions_matter() -> None:
     assert _error(graph, truth) < 1
 
 
-@pytest.mark.parametrize("recipe", [ReleasedRecipe((60, 120)), PaperRecipe((60, 120))], ids=["released", "paper"])
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        pytest.param(ReleasedRecipe((60, 120)), id="released", marks=pytest.mark.large),
+        pytest.param(PaperRecipe((60, 120)), id="paper"),
+    ],
+)
 def test_where_false_edges_do_not_agree_nothing_changes(recipe: ReleasedRecipe | PaperRecipe) -> None:
     for seed in range(6):
         graph = recipe.sample(np.random.default_rng(seed)).graph

@@ -165,6 +165,7 @@ def test_choices_of_axes_change_nothing() -> None:
     torch.testing.assert_close(one.outlier_probability, other.outlier_probability, atol=1e-5, rtol=0)
 
 
+@pytest.mark.large
 def test_half_of_the_edges_false_between_cameras_that_look_every_way() -> None:
     """Each joined to the six next to it. CleanNet knows nothing of these, and led into a wrong valley."""
     graphs = [nearby(seed, 150, 6, 0.5)[:2] for seed in range(2)]

@@ -213,6 +213,7 @@ def test_none_is_invented(kind: str) -> None:
     assert torch.equal(solution.outlier_score, blind.outlier_score)
 
 
+@pytest.mark.large
 def test_the_bodys_axes_do_not_matter() -> None:
     """All bodies turned alike: so is the mounting."""
     graph, turn = (

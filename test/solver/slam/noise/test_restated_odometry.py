@@ -30,8 +30,14 @@ def by_rotations(graph: ViewGraph) -> ViewGraph:
     return replace(graph, translation=None)
 
 
-@pytest.mark.parametrize("own_deg", [0.0, 0.1])
-@pytest.mark.parametrize("translations", [False, True])
+@pytest.mark.parametrize(
+    ("own_deg", "translations"),
+    [
+        (0.0, True),
+        (0.1, False),
+        *(pytest.param(*each, marks=pytest.mark.large) for each in ((0.0, False), (0.1, True))),
+    ],
+)
 def test_the_answer_is_that_of_the_graph_without_them(own_deg: float, translations: bool) -> None:
     """Errors of a step are of .3°; taken for measurements, these edges would hide them."""
     case = drawn("hills: 30 % random")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from rotavg_ros import solve
 from rotavg_ros.datasets.simulation.slam_config import World
@@ -24,6 +25,7 @@ def ended(pose: PoseMode, believed: np.ndarray) -> Rival:
     return Rival(pose.problem.mode, estimate_poses(pose.problem, hold=True, start=start))
 
 
+@pytest.mark.large
 def test_a_right_run_that_false_ones_outdo_is_found_and_nothing_that_is_false() -> None:
     made = building(4, false_share=0.65, tilts=0.05)
     pose = pose_mode(made.graph)

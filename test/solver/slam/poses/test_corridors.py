@@ -148,6 +148,7 @@ def test_runs_that_agree_between_the_walls_are_no_slip(seed: int) -> None:
     assert np.sqrt((position_errors(solution.position.numpy(), run.position) ** 2).mean()) < 1.0
 
 
+@pytest.mark.large
 def test_ends_and_the_bodys_axes_do_not_matter() -> None:
     """The shape of errors is that in the axes of the body at the older end, whatever these are called."""
     run = walk(66)

@@ -78,9 +78,8 @@ def in_a_building(seed: int, ahead: float) -> tuple[SimulatedRun, ViewGraph]:
     return run, replace(graph, translation=way)
 
 
-@pytest.mark.parametrize(
-    ("ahead", "least", "most"), [(0.4, 0.0, 0.95), pytest.param(0.0, 0.97, 1.03, marks=pytest.mark.large)]
-)
+@pytest.mark.large
+@pytest.mark.parametrize(("ahead", "least", "most"), [(0.4, 0.0, 0.95), (0.0, 0.97, 1.03)])
 def test_positions_in_a_building_are_better_by_it(ahead: float, least: float, most: float) -> None:
     """Where closures err more along corridors; otherwise little changes."""
     ratio = []

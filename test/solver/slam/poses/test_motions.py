@@ -69,7 +69,7 @@ def test_motions_do_not_depend_on_the_end_that_edges_are_stated_from(streets: St
     np.testing.assert_array_equal(one.agree(1, 2), two.agree(1, 2))
 
 
-@pytest.mark.parametrize("tilted", [False, True])
+@pytest.mark.parametrize("tilted", [False, pytest.param(True, marks=pytest.mark.large)])
 def test_motions_do_not_depend_on_the_bodys_axes(streets: Streets, tilted: bool) -> None:
     """Nor on whether the robots stay in a plane: where one rolls a little at each step, all three axes are judged."""
     here = streets

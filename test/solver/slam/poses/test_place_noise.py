@@ -46,7 +46,9 @@ def test_one_absurd_closure_is_flagged_and_no_other(metres: float) -> None:
     assert errors(run, answer)[1] < 0.3
 
 
-@pytest.mark.parametrize(("kind", "seed"), [("building: 30 % random", 3), ("building: 15 closures", 4)])
+@pytest.mark.parametrize(
+    ("kind", "seed"), [pytest.param("building: 30 % random", 3, marks=pytest.mark.large), ("building: 15 closures", 4)]
+)
 def test_a_false_closure_moves_nothing_however_far_it_leads(kind: str, seed: int) -> None:
     graph = next(drawings(stress.kinds((kind,), translations=True), [seed])).graph
     assert graph.translation is not None

@@ -66,7 +66,8 @@ def test_a_slip_that_three_pairs_of_places_tell_of_is_found(witnesses: int) -> N
     assert not (solution.outlier_score.numpy() > 0.5)[case.is_closure].any()
 
 
-@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.large), 1])
+@pytest.mark.large
+@pytest.mark.parametrize("seed", [0, 1])
 def test_odometry_that_is_off_by_some_degrees_now_and_then_has_wide_tails(seed: int) -> None:
     """By 3 to 13° at one percent of the steps: as slips, each would have to pay for itself."""
     case = drawn("city: small slips, 30 % grouped, noisy closures", seed)

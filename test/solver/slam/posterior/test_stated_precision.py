@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 import torch
 
 from rotavg_ros import ViewGraph, solve
@@ -60,6 +61,7 @@ def mean_errors(stated: str, num_seeds: int = 2) -> np.ndarray:
     return np.array(errors)
 
 
+@pytest.mark.large
 def test_right_precisions_help_and_wrong_ones_do_no_harm() -> None:
     missing = mean_errors("missing")
     for uninformative in ("unit", "next to nothing"):
