@@ -41,6 +41,7 @@ def test_what_cannot_be_kept_is_compiled_all_the_same() -> None:
     assert compiled(names["twice"])(3) == 6
 
 
+@pytest.mark.large
 def test_a_photo_collection_is_solved_without_numba() -> None:
     code = (
         "import sys\n"

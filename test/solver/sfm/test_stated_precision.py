@@ -42,6 +42,7 @@ def _error(graph: ViewGraph, truth: torch.Tensor) -> float:
     return float(orientation_errors(solve(graph, profile="sfm").body_from_world, truth).mean())
 
 
+@pytest.mark.large
 @settings(max_examples=8)
 @given(st.integers(0, 2**16))
 def test_precisions_that_are_noise_change_little(seed: int) -> None:

@@ -81,6 +81,7 @@ def test_true_information_helps_more_than_its_size_alone() -> None:
     assert means["full"] < 0.7 * means["none"]
 
 
+@pytest.mark.large
 @settings(max_examples=2)
 @given(st.integers(0, 2**16))
 def test_information_that_is_noise_changes_little(seed: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -39,6 +40,7 @@ def _beside(one: ViewGraph, other: ViewGraph) -> ViewGraph:
     )
 
 
+@pytest.mark.large
 def test_a_part_that_is_turned_with_its_root_is_no_other_answer() -> None:
     """The first keyframe is certain, and what hangs on it as certain as alone."""
     for seed in range(3):

@@ -41,6 +41,7 @@ def _error(graph: ViewGraph, truth: torch.Tensor, method: str = "neurora") -> fl
     return float(torch.rad2deg(orientation_errors(answer, truth)).mean())
 
 
+@pytest.mark.large
 def test_failed_registrations_that_agree_are_seen_through() -> None:
     """A robust cost alone is drawn to where all scans look alike."""
     found = np.array([[_error(*_scans(seed), method) for method in (_WITHOUT, "neurora")] for seed in range(4)])

@@ -91,6 +91,7 @@ def test_a_few_closures_tell_little() -> None:
     assert value.max() / value.min() < 1.6
 
 
+@pytest.mark.large
 def test_directions_of_closures_do_not_matter() -> None:
     graph, _ = sphere(0, UNEVEN)
     turned = graph.reverse_edges(~graph.is_odometry & (torch.arange(graph.num_edges) % 2 == 0))

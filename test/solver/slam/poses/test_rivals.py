@@ -64,6 +64,7 @@ def test_tearing_robots_apart_makes_nothing_likelier() -> None:
     assert rivals.share[0] > 0.9 and not rivals.modes[0].is_false.all()
 
 
+@pytest.mark.large
 @torch.no_grad()
 def test_places_are_asked_of_the_labelling_without_slips_too() -> None:
     """Rotations alone prefer a slip, by far more than what rivals are compared for; places know that nothing jumped."""

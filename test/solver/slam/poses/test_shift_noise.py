@@ -71,6 +71,7 @@ def test_the_noise_to_begin_with_is_what_odometry_tells() -> None:
     assert levels[0][0] < USUAL[0] == levels[1][0]
 
 
+@pytest.mark.large
 @torch.no_grad()
 def test_what_runs_have_in_common_is_estimated() -> None:
     """Of the variance of closures' translations, from next to none to nearly all."""

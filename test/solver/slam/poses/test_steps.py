@@ -55,6 +55,7 @@ def laps(
     return ViewGraph.create(source, target, relative.as_quat(), kind=kind, translation=way), position
 
 
+@pytest.mark.large
 @torch.no_grad()
 def test_what_a_step_errs_by_is_found() -> None:
     """Both parts of the variance, of odometry that errs by one of them alone."""

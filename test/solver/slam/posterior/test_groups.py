@@ -28,7 +28,8 @@ def there_and_back(seed: int, turn_deg: float, planar: bool = True) -> tuple[Vie
     return graph, truth, is_false
 
 
-@pytest.mark.parametrize("planar", [pytest.param(True, marks=pytest.mark.large), False])
+@pytest.mark.large
+@pytest.mark.parametrize("planar", [True, False])
 def test_a_group_that_agrees_counts_as_one(planar: bool) -> None:
     believed = []
     for seed in range(6):

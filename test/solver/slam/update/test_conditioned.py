@@ -126,6 +126,7 @@ def test_what_is_not_reckoned_in_yet_has_a_score_by_its_residual() -> None:
     assert (flagged == is_false[new]).mean() > 0.8
 
 
+@pytest.mark.large
 def test_a_long_closure_counts_for_less_than_a_short_one() -> None:
     """As in a whole solve, whose closures' translations err by a share of their length, too."""
     graph, _ = drawn(translations=True, planar=True)

@@ -226,6 +226,7 @@ def test_what_cannot_be_gone_on_from_is_solved_from_scratch_in_silence_too() -> 
     assert torch.equal(found.body_from_world, cold.body_from_world)
 
 
+@pytest.mark.large
 def test_between_ticks_what_has_no_translation_moves_no_position() -> None:
     """New closures without one count with their rotation alone; new odometry without one ends the positions."""
     full, _ = simulated(translations=True, planar=True)
