@@ -145,7 +145,8 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "update": {"fine_net", "graph", "links", "network", "noise", "poses", "posterior", "stages"},
         "stages": {"graph", "network", "noise", "preparation"},
         "posterior": {"graph", "network", "noise", "preparation", "stages"},
-        "links": {"graph", "noise"},
+        "hung_nodes": {"graph"},
+        "links": {"graph", "hung_nodes", "noise"},
         "solve": {
             *("fine_net", "graph", "links", "network", "noise", "options", "poses"),
             *("posterior", "preparation", "stages", "update"),

@@ -18,12 +18,17 @@ import torch
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
-from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths, odometry_forest
-from rotavg_ros.solver.slam.noise.restated_odometry import LOOP_STEPS, is_of_its_kind, restated_odometry
-from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
+from rotavg_ros.solver.slam.graph.odometry_paths import LOOP_STEPS, OdometryPaths, near_a_branch, odometry_forest
+from rotavg_ros.solver.slam.hung_nodes import hung
+from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE
+from rotavg_ros.solver.slam.noise.restated_odometry import is_of_its_kind, restated_odometry
+from rotavg_ros.view_graph import FALSE_CLOSURE_M, EdgeKind, EdgeLabel, ViewGraph
 
-# Links are odometry if there are as many as other closures, and at least so many.
-_LEAST_LINKS = 100
+# Links are odometry if there are as many as other closures, and at least so many, of which so large a share agrees with
+# odometry. Where more are false they are judged like any closure: false ones would decide what is usual.
+_LEAST_LINKS, _AGREEING = 100, 0.75
+# Steps of the edge by which a submap hangs on odometry; more than one, so that no chain is led over it.
+_HANG_STEPS = 2.0
 
 
 def with_links(graph: ViewGraph) -> tuple[ViewGraph, np.ndarray]:
@@ -33,11 +38,24 @@ def with_links(graph: ViewGraph) -> tuple[ViewGraph, np.ndarray]:
     """
     if int((~graph.is_odometry).sum()) < _LEAST_LINKS:
         return graph, np.zeros(0, dtype=np.int64)
+    graph, links = _with_hung(graph)
     short = _Short.of(graph)
-    others = int((~graph.is_odometry).sum()) - len(short.edge)
-    if len(short.edge) < max(_LEAST_LINKS, others):
+    if len(short.edge) < max(_LEAST_LINKS, short.others) or short.agrees.mean() < _AGREEING:
+        return graph, links
+    return short.as_odometry(graph, links, 0)
+
+
+def _with_hung(graph: ViewGraph) -> tuple[ViewGraph, np.ndarray]:
+    """The graph with submaps on odometry, and the edges by which they hang on it; none unless these are made of it."""
+    edge = hung(graph)
+    if len(edge) == 0:
+        return graph, edge
+    tried = as_odometry(graph, edge, np.full(len(edge), _HANG_STEPS))
+    paths = OdometryPaths.along(tried, odometry_forest(tried))
+    beside = paths.outside[near_a_branch(tried, paths) >= 0]
+    if restated_odometry(tried, paths)[beside].mean() < _AGREEING:
         return graph, np.zeros(0, dtype=np.int64)
-    return short.as_odometry(graph, np.zeros(0, dtype=np.int64), 0)
+    return tried, edge
 
 
 def with_more_links(graph: ViewGraph, links: np.ndarray, known: int) -> tuple[ViewGraph, np.ndarray]:
@@ -50,6 +68,8 @@ def with_more_links(graph: ViewGraph, links: np.ndarray, known: int) -> tuple[Vi
     """
     if len(links) == 0 or graph.num_edges == known:
         return graph, links
+    graph, more = _with_hung(graph)
+    links = np.concatenate((links, more))
     return _Short.of(graph, links).as_odometry(graph, links, known)
 
 
@@ -73,12 +93,15 @@ class _Short(NamedTuple):
     Attributes:
         edge: ``(n,)``.
         steps: ``(n,)`` odometry steps between their ends.
-        agrees: ``(n,)`` bool, whether they differ from odometry by no more than is usual per step.
+        agrees: ``(n,)`` bool, whether they differ from odometry by no more than is usual per step; none does
+            where most differ by what would make a closure false.
+        others: number of other closures that are neither.
     """
 
     edge: np.ndarray
     steps: np.ndarray
     agrees: np.ndarray
+    others: int
 
     @classmethod
     def of(cls, graph: ViewGraph, links: Sequence[int] | np.ndarray = ()) -> _Short:
@@ -86,21 +109,29 @@ class _Short(NamedTuple):
         paths = OdometryPaths.along(graph, odometry_forest(graph))
         outside = paths.outside
         chosen = np.isin(outside, links) | ~graph.is_odometry.numpy()[outside]
-        chosen &= (paths.path_steps <= LOOP_STEPS) & ~restated_odometry(graph, paths)[outside]
-        chosen &= graph.label.numpy()[outside] != EdgeLabel.REJECTED
+        chosen &= ~restated_odometry(graph, paths)[outside] & (graph.label.numpy()[outside] != EdgeLabel.REJECTED)
+        is_short = (paths.path_steps <= LOOP_STEPS) | (near_a_branch(graph, paths) >= 0)
+        others = int((chosen & ~is_short).sum())
+        chosen &= is_short
         edge, steps = outside[chosen], paths.path_steps[chosen]
         turned = (rotations.log(paths.residual).numpy()[chosen] ** 2).sum(axis=1)
         shifted = _shifted(graph, paths, edge)
-        agrees = is_of_its_kind(turned / steps, graph.rotation_components)
+        agrees = is_of_its_kind(turned / steps, graph.rotation_components) & _mostly_below(turned, OUTLIER_ANGLE)
         if shifted is not None:
-            agrees &= np.isnan(shifted) | is_of_its_kind(shifted / steps, 3)
-        return cls(edge, steps, agrees)
+            known = np.isfinite(shifted)
+            usual = is_of_its_kind(shifted / steps, 3) & _mostly_below(shifted[known], FALSE_CLOSURE_M)
+            agrees &= ~known | usual
+        return cls(edge, steps, agrees, others)
 
     def as_odometry(self, graph: ViewGraph, links: np.ndarray, known: int) -> tuple[ViewGraph, np.ndarray]:
         """The graph in which those from edge ``known`` on that agree are odometry, and ``(n,)`` these and ``links``."""
         more = np.flatnonzero(self.agrees & (self.edge >= known))
         more = more[np.argsort(self.edge[more])]
         return as_odometry(graph, self.edge[more], self.steps[more]), np.concatenate((links, self.edge[more]))
+
+
+def _mostly_below(square: np.ndarray, most: float) -> bool:
+    return len(square) == 0 or bool(np.median(square) < most**2)
 
 
 def _shifted(graph: ViewGraph, paths: OdometryPaths, edge: np.ndarray) -> np.ndarray | None:

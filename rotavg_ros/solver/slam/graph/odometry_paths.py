@@ -21,8 +21,12 @@ from rotavg_ros.solver.algebra.spanning_forest import (
 )
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
+# What spans more steps is a loop closure.
+LOOP_STEPS = 32.0
 # Cost of a closure in the forest: larger than that of any number of odometry steps.
 _CLOSURE_COST = 1e9
+# Number of odometry edges at a node on which a branch hangs.
+_FORK = 3
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,22 @@ def odometry_forest(graph: ViewGraph) -> SpanningForest:
     return minimum_spanning_forest(graph, torch.where(usable, cost, _CLOSURE_COST**2), is_root=odometry_ends(graph))
 
 
+def runs_along(node: np.ndarray, chain: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """``(n,)`` number of each keyframe's run: those of one node and chain without a gap of more than a loop's steps.
+
+    Args:
+        node: ``(n,)`` the node that each keyframe is joined to.
+        chain, position: ``(n,)`` of keyframes.
+    """
+    order = np.lexsort((position, chain, node))
+    begins = np.ones(len(order), dtype=bool)
+    same = (np.diff(node[order]) == 0) & (np.diff(chain[order]) == 0)
+    begins[1:] = ~same | (np.diff(position[order]) > LOOP_STEPS)
+    run = np.empty(len(order), dtype=np.int64)
+    run[order] = np.cumsum(begins) - 1
+    return run
+
+
 def beside_the_chain(graph: ViewGraph) -> np.ndarray:
     """``(M,)`` bool, odometry outside of that forest."""
     beside = graph.is_odometry.numpy().copy()
@@ -118,6 +138,36 @@ def _is_chain(graph: ViewGraph) -> bool:
     steps = graph.is_odometry
     ends = torch.stack((graph.source[steps], graph.target[steps])).numpy()
     return all(np.bincount(end, minlength=1).max() <= 1 for end in (ends.min(axis=0), ends.max(axis=0)))
+
+
+def near_a_branch(graph: ViewGraph, paths: OdometryPaths) -> np.ndarray:
+    """``(F,)`` the branch of odometry from which each closure leads to keyframes near it and each other; else -1.
+
+    A branch is a single node that hangs on the middle of a chain.
+
+    Args:
+        graph: the graph.
+        paths: its paths.
+    """
+    near = np.full(len(paths.outside), -1)
+    parent_edge = paths.forest.parent_edge
+    edges = parent_edge[(parent_edge >= 0) & paths.hangs_on_odometry]
+    ends = torch.stack((graph.source, graph.target)).numpy()
+    count = np.bincount(ends[:, edges].ravel(), minlength=graph.num_nodes)
+    is_branch = np.zeros(graph.num_nodes, dtype=bool)
+    for one, other in (ends[:, edges], ends[::-1][:, edges]):
+        is_branch[one[(count[one] == 1) & (count[other] >= _FORK)]] = True
+    ends = ends[:, paths.outside]
+    some = np.flatnonzero((is_branch[ends].sum(axis=0) == 1) & np.isfinite(paths.path_steps))
+    if len(some) == 0:
+        return near
+    branch = np.where(is_branch[ends[0, some]], ends[0, some], ends[1, some])
+    other = ends[:, some].sum(axis=0) - branch
+    run = runs_along(branch, paths.chain[other], paths.position[other])
+    least = np.full(run.max() + 1, np.inf)
+    np.minimum.at(least, run, paths.path_steps[some])
+    near[some] = np.where(least[run] <= LOOP_STEPS, branch, -1)
+    return near
 
 
 def odometry_ends(graph: ViewGraph) -> np.ndarray:

@@ -18,20 +18,21 @@ import torch
 from scipy.special import gammaincinv
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths
+from rotavg_ros.solver.slam.graph.odometry_paths import LOOP_STEPS, OdometryPaths, near_a_branch
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.noise.mixture import Discrepancies
 from rotavg_ros.solver.slam.noise.model import likeliest_by_chain
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-# What spans more steps is a loop closure; bounds of bands of steps that are judged by themselves.
-LOOP_STEPS = 32.0
+# Bounds of bands of steps that are judged by themselves.
 _BANDS = (0.0, 4.0, 8.0, 16.0, LOOP_STEPS)
 # Closures are made of odometry if they see at most this share of the variance that loop closures see, with all but this
 # probability or by so many standard errors.
 _SEEN, _UNLIKELY, _SIGMAS = 0.25, 0.001, 3.0
 # Edges are compared with so many others that begin next; fewer pairs than this say nothing.
 _NEXT, _FEW = 4, 30
+# … of one branch of odometry, with those so many ahead: the farther, the less their own errors count.
+_APART = (1, 8, 32)
 # … and those that contradict odometry with so many others of them.
 _BESIDE = 8
 # Nats by which loop closures must show that some of them are good.
@@ -51,15 +52,18 @@ def restated_odometry(graph: ViewGraph, paths: OdometryPaths) -> np.ndarray:
     restated = np.zeros(graph.num_edges, dtype=bool)
     chosen = ~graph.is_odometry.numpy()[paths.outside] & np.isfinite(paths.path_steps)
     chosen &= graph.label.numpy()[paths.outside] == EdgeLabel.AUTOMATIC
-    steps = paths.path_steps[chosen]
-    is_loop = steps > LOOP_STEPS
+    steps, end = paths.path_steps[chosen], near_a_branch(graph, paths)[chosen]
+    at_branch = end >= 0
+    is_loop = (steps > LOOP_STEPS) & ~at_branch
     if is_loop.all() or not is_loop.any():
         return restated
     edge, k = paths.outside[chosen], graph.rotation_components
     seen = _Seen.of(graph, paths, chosen)
     square = (seen.off**2).sum(axis=1)
-    bands = [np.flatnonzero((steps > low) & (steps <= high)) for low, high in pairwise(_BANDS)]
+    bands = [np.flatnonzero((steps > low) & (steps <= high) & ~at_branch) for low, high in pairwise(_BANDS)]
     bounds = [seen.most_variance(band, k) for band in bands]
+    bands.append(np.flatnonzero(at_branch))
+    bounds.append(seen.most_between(bands[-1], end[at_branch], k))
     # Of good loop closures this is more than odometry's variance: the larger part of them need not be good.
     if min(bounds) > _SEEN * float(np.median(square[is_loop] / steps[is_loop])) / _quantile(0.5, k):
         return restated
@@ -92,7 +96,10 @@ def _is_bias(graph: ViewGraph, paths: OdometryPaths, chosen: np.ndarray, seen: _
         seen: what they see.
     """
     steps = paths.path_steps[chosen]
-    short, is_loop = np.flatnonzero(steps <= LOOP_STEPS), steps > LOOP_STEPS
+    at_branch = near_a_branch(graph, paths)[chosen] >= 0
+    short, is_loop = np.flatnonzero((steps <= LOOP_STEPS) & ~at_branch), (steps > LOOP_STEPS) & ~at_branch
+    if len(short) == 0:
+        return False
     ends = torch.stack((graph.source, graph.target))[:, paths.outside[chosen][short]]
     older = torch.where(torch.from_numpy(paths.position)[ends].argmin(dim=0).bool(), ends[1], ends[0])
     turned = rotations.rotate(paths.orientation[older], torch.from_numpy(seen.off[short])).numpy()
@@ -124,11 +131,13 @@ class _Seen(NamedTuple):
     Attributes:
         off: ``(n, 3)`` rad, discrepancies with odometry, from the older end to the newer, in a common frame.
         first, last: ``(n,)`` positions of the ends along odometry; chains are far apart.
+        of_last: ``(n,)`` the node at the last.
     """
 
     off: np.ndarray
     first: np.ndarray
     last: np.ndarray
+    of_last: np.ndarray
 
     @classmethod
     def of(cls, graph: ViewGraph, paths: OdometryPaths, chosen: np.ndarray) -> _Seen:
@@ -138,7 +147,30 @@ class _Seen(NamedTuple):
         position = paths.position + apart * np.unique(paths.chain, return_inverse=True)[1]
         ends = np.stack([position[each.numpy()[edge]] for each in (graph.source, graph.target)])
         off = rotations.log(paths.residual).numpy()[chosen]
-        return cls(np.where((ends[0] > ends[1])[:, None], -off, off), ends.min(axis=0), ends.max(axis=0))
+        nodes = np.stack([each.numpy()[edge] for each in (graph.source, graph.target)])
+        is_last = ends[0] > ends[1]
+        of_last = np.where(is_last, nodes[0], nodes[1])
+        return cls(np.where(is_last[:, None], -off, off), ends.min(axis=0), ends.max(axis=0), of_last)
+
+    def most_between(self, among: np.ndarray, end: np.ndarray, components: int) -> float:
+        """The same bound from pairs of closures ``(m,)`` from one branch of odometry ``(m,)``; inf if there are none.
+
+        What two say of the way between their other ends contains odometry's error on it.
+        """
+        at = np.where(self.of_last[among] == end, self.first[among], self.last[among])
+        off = np.where((self.of_last[among] == end)[:, None], self.off[among], -self.off[among])
+        order = np.lexsort((at, end))
+        at, off, end = at[order], off[order], end[order]
+        bound = np.inf
+        for ahead in _APART:
+            one, other = slice(None, -ahead), slice(ahead, None)
+            steps = at[other] - at[one]
+            pair = (end[other] == end[one]) & (steps > 0)
+            if pair.sum() >= _FEW:
+                square = ((off[other] - off[one])[pair] ** 2).sum(axis=1) / steps[pair]
+                square = np.minimum(square, _FARTHEST**2 * components * _usual(square, components))
+                bound = min(bound, float(square.sum() / _quantile(_UNLIKELY, components * len(square))))
+        return bound
 
     def a_slip(self, among: np.ndarray, components: int) -> bool:
         """Whether two of these closures ``(m,)`` over a common step, with no end in common, contradict it alike.
@@ -163,6 +195,7 @@ class _Seen(NamedTuple):
         Their own squares contain it. Over few steps, where their own errors are larger, products of two that overlap
         tell more.
         """
+        among = among[self.last[among] > self.first[among]]
         if len(among) == 0:
             return np.inf
         order = among[np.argsort(self.first[among], kind="stable")]
