@@ -19,14 +19,19 @@ _LEAST, _LEAST_IN_ALL = 3, 100
 _ROUNDING = 1e-12
 
 
-def hung(graph: ViewGraph) -> np.ndarray:
-    """``(n,)`` the closure of each such node by which it hangs on odometry: amid those that agree."""
+def hung(graph: ViewGraph, *, some_do: bool = False) -> np.ndarray:
+    """``(n,)`` the closure of each such node by which it hangs on odometry: amid those that agree.
+
+    Args:
+        graph: N nodes, M edges.
+        some_do: whether other nodes are known to hang, so that few more are enough.
+    """
     none = np.zeros(0, dtype=np.int64)
     is_closure = ~graph.is_odometry & (graph.label != EdgeLabel.REJECTED)
     ends = torch.stack((graph.source, graph.target)).numpy()
     touched = np.bincount(ends[:, graph.is_odometry.numpy()].ravel(), minlength=graph.num_nodes) > 0
     edge = np.flatnonzero(is_closure.numpy() & (touched[ends].sum(axis=0) == 1))
-    if len(edge) < _LEAST_IN_ALL:
+    if len(edge) < (_LEAST if some_do else _LEAST_IN_ALL):
         return none
     paths = OdometryPaths.along(graph, odometry_forest(graph))
     is_target = touched[ends[1, edge]]
@@ -37,7 +42,7 @@ def hung(graph: ViewGraph) -> np.ndarray:
     order = np.lexsort((run, -size, node))
     first = order[np.unique(node[order], return_index=True)[1]]
     chosen = np.isin(run, run[first][size[first] >= _LEAST])
-    if chosen.sum() < max(_LEAST_IN_ALL, int(is_closure.sum()) - chosen.sum()):
+    if not chosen.any() or not (some_do or chosen.sum() >= max(_LEAST_IN_ALL, int(is_closure.sum()) - chosen.sum())):
         return none
     edge, keyframe, run = edge[chosen], keyframe[chosen], np.unique(run[chosen], return_inverse=True)[1]
     stated = graph.target_from_source[edge]

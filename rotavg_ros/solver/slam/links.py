@@ -18,7 +18,13 @@ import torch
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
-from rotavg_ros.solver.slam.graph.odometry_paths import LOOP_STEPS, OdometryPaths, near_a_branch, odometry_forest
+from rotavg_ros.solver.slam.graph.odometry_paths import (
+    LOOP_STEPS,
+    OdometryPaths,
+    near_a_branch,
+    odometry_ends,
+    odometry_forest,
+)
 from rotavg_ros.solver.slam.hung_nodes import hung
 from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE
 from rotavg_ros.solver.slam.noise.restated_odometry import is_of_its_kind, restated_odometry
@@ -45,15 +51,15 @@ def with_links(graph: ViewGraph) -> tuple[ViewGraph, np.ndarray]:
     return short.as_odometry(graph, links, 0)
 
 
-def _with_hung(graph: ViewGraph) -> tuple[ViewGraph, np.ndarray]:
+def _with_hung(graph: ViewGraph, *, some_do: bool = False) -> tuple[ViewGraph, np.ndarray]:
     """The graph with submaps on odometry, and the edges by which they hang on it; none unless these are made of it."""
-    edge = hung(graph)
+    edge = hung(graph, some_do=some_do)
     if len(edge) == 0:
         return graph, edge
     tried = as_odometry(graph, edge, np.full(len(edge), _HANG_STEPS))
     paths = OdometryPaths.along(tried, odometry_forest(tried))
     beside = paths.outside[near_a_branch(tried, paths) >= 0]
-    if restated_odometry(tried, paths)[beside].mean() < _AGREEING:
+    if len(beside) == 0 or restated_odometry(tried, paths)[beside].mean() < _AGREEING:
         return graph, np.zeros(0, dtype=np.int64)
     return tried, edge
 
@@ -68,7 +74,8 @@ def with_more_links(graph: ViewGraph, links: np.ndarray, known: int) -> tuple[Vi
     """
     if len(links) == 0 or graph.num_edges == known:
         return graph, links
-    graph, more = _with_hung(graph)
+    ends = odometry_ends(graph)
+    graph, more = _with_hung(graph, some_do=bool(ends[torch.stack((graph.source, graph.target))[:, links]].any()))
     links = np.concatenate((links, more))
     return _Short.of(graph, links).as_odometry(graph, links, known)
 
