@@ -90,7 +90,11 @@ def log(folder: Path, name: str) -> list[dict[str, float]]:
 
 
 @pytest.mark.parametrize(
-    "name", ["sfm-clean-net", "sfm-fine-net", "slam-clean-net", "slam-fine-net", "paper-clean-net", "paper-fine-net"]
+    "name",
+    [
+        *("sfm-clean-net", "slam-clean-net", "paper-fine-net"),
+        *(pytest.param(name, marks=pytest.mark.large) for name in ("sfm-fine-net", "slam-fine-net", "paper-clean-net")),
+    ],
 )
 def test_resumed_run_equals_unbroken_run_bit_for_bit(name: str, tmp_path: Path) -> None:
     make_trainer(name, tmp_path / "unbroken").run()

@@ -118,6 +118,7 @@ def test_exact_edges_tell_of_no_density() -> None:
     assert errors_deg(measured(truth, source, target, Rotation.from_quat(noise)), truth, "neurora") < 1e-3
 
 
+@pytest.mark.large
 @pytest.mark.parametrize("recipe", [ReleasedRecipe(cameras=(150, 200)), PaperRecipe(cameras=(150, 200))])
 def test_where_half_is_right_nothing_changes(recipe: ReleasedRecipe | PaperRecipe) -> None:
     graph = recipe.sample(np.random.default_rng(7)).graph

@@ -47,6 +47,7 @@ def test_other_numbers_of_keyframes_change_nothing(kind: str) -> None:
     torch.testing.assert_close(found.outlier_score, expected.outlier_score, atol=0.01, rtol=0)
 
 
+@pytest.mark.large
 @pytest.mark.parametrize(
     "kind", ["building: closures of 6°", pytest.param("hills: gyroscope bias, 30 % random", marks=pytest.mark.large)]
 )

@@ -128,6 +128,7 @@ def test_a_jump_is_one_however_its_step_is_written() -> None:
     assert float((before.position - after.position).norm(dim=1).max()) < 0.1
 
 
+@pytest.mark.large
 def test_a_jump_is_remembered_while_the_graph_grows() -> None:
     graph = jumped(graph_of(simulated(2, num_keyframes=400, laps=3.0, closures_per_keyframe=0.3)), 120, (7.0, 4.0, 0.0))
     answer = solve(up_to(graph, 300))

@@ -57,6 +57,7 @@ def slipping_walk(seed: int) -> tuple[ViewGraph, torch.Tensor, torch.Tensor]:
     return graph, torch.from_numpy(truth), torch.from_numpy(is_false)
 
 
+@pytest.mark.large
 @pytest.mark.parametrize(
     "seed",
     [
