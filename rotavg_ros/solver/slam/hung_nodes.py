@@ -55,11 +55,10 @@ def hung(graph: ViewGraph, *, some_do: bool = False) -> np.ndarray:
     # Of those as near to the mean as most, the one in the middle of the run.
     near = off <= 4 * _median(off, run)[run] + _ROUNDING
     at = paths.position[keyframe]
-    between = np.stack([at, -at])
-    ends_of_run = np.full((2, run.max() + 1), -np.inf)
-    for number in range(2):
-        np.maximum.at(ends_of_run[number], run, between[number])
-    off_middle = np.abs(2 * at - (ends_of_run[0] - ends_of_run[1])[run])
+    first, last = np.full(run.max() + 1, np.inf), np.full(run.max() + 1, -np.inf)
+    np.minimum.at(first, run, at)
+    np.maximum.at(last, run, at)
+    off_middle = np.abs(2 * at - (first + last)[run])
     order = np.lexsort((edge, off_middle, ~near, run))
     return np.asarray(edge[order[np.unique(run[order], return_index=True)[1]]])
 

@@ -147,6 +147,16 @@ def test_where_many_are_false_all_are_closures(share: float) -> None:
     assert len(with_links(replace(graph, target_from_source=stated))[1]) == 0
 
 
+def test_an_absurd_translation_is_no_links() -> None:
+    graph = linked(drawn("building: 30 % random", 1), 0.3, by_truth=True)
+    links, shift = with_links(graph)[1], graph.translation.clone()
+    shift[links[5]] = 1e200
+    np.testing.assert_array_equal(with_links(replace(graph, translation=shift))[1], np.delete(links, 5))
+    solution = solve(replace(graph, translation=shift), profile="slam")
+    assert solution.outlier_score[links[5]] > 0.9
+    assert solution.position is not None and bool(torch.isfinite(torch.as_tensor(solution.position)).all())
+
+
 def test_rejected_ones_stay_closures() -> None:
     graph = linked(drawn("building: 30 % random", 1), 0.3, by_truth=True)
     links, label = with_links(graph)[1], graph.label.clone()
