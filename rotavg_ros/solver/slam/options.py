@@ -26,6 +26,7 @@ SWITCHES: dict[str, str] = {
     "mounting": "the closures' sensor is mounted as stated",
     "turns": "the errors of odometry do not depend on how far it turns",
     "settling": "labels are only flipped; the search never continues from their probabilities",
+    "doubts": "good closures of little evidence that support each other are rejected only one at a time",
     "rejected-runs": "good closures of a run that support each other are rejected only one at a time",
     "joins": "chains that closures alone join are never turned, or placed, as wholes by others of these closures",
     "shifts": "a slip stays in the segment in which it was found",

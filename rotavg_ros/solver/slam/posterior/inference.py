@@ -10,13 +10,14 @@ from torch import Tensor
 from rotavg_ros.solver.slam.posterior.em import polish, step
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.moves import noise, slips
+from rotavg_ros.solver.slam.posterior.moves.doubts import propose_doubts
 from rotavg_ros.solver.slam.posterior.moves.flips import flipped
 from rotavg_ros.solver.slam.posterior.moves.joins import propose_joins
 from rotavg_ros.solver.slam.posterior.moves.runs import propose_rejected_runs
 from rotavg_ros.solver.slam.posterior.moves.settling import propose_settling
 from rotavg_ros.solver.slam.posterior.moves.splits import propose_splits
 from rotavg_ros.solver.slam.posterior.moves.starts import starts, turned_further, turned_parts
-from rotavg_ros.solver.slam.posterior.moves.tails import hides_slips, propose_tails
+from rotavg_ros.solver.slam.posterior.moves.tails import hidden_slips, propose_tails
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import with_noise
 from rotavg_ros.solver.slam.posterior.state import State
@@ -25,6 +26,8 @@ from rotavg_ros.solver.slam.stages import CleanedClosures
 
 # After a gain of this many nats the search leaves the old mode at once: its promising moves exist in the new one too.
 _GAIN = 1.0
+# Largest decrease of F, nats for each false closure, that is hoped for from further moves once a slip was taken back.
+_REGAINED = 0.2
 # Number of best modes from which moves are tried.
 _BEAM = 3
 
@@ -66,6 +69,8 @@ class Search:
             self.move_on()
         if may_cut:
             self._cut_further(prepared)
+        if not self.problem.without & {"slips", "mending"}:
+            self._take_back()
 
     def _cut_further(self, prepared: Prepared) -> None:
         """Minimum cuts from the best mode, as long as they improve it."""
@@ -74,6 +79,52 @@ class Search:
             least = best.cost
             self._begun("minimum cuts", turned_further(self.problem, prepared, best.state))
             self.move_on()
+
+    def _take_back(self) -> None:
+        """Takes slips of the best mode back, each and then all, whatever is predicted, as long as this improves it.
+
+        Behind a slip odometry has bent towards the closures that it made good, so residuals that are turned back as
+        they are predict nothing.
+        """
+        least = np.inf
+        while self.modes[0].cost < least - _GAIN and len(taken := _slips(best := self.modes[0])):
+            least = best.cost
+            mended = [self._doubted(proposal) for proposal in slips.propose_turning_back(best, taken)]
+            if self.modes[0].cost > least - _GAIN:
+                self._search_from(self._unslipped(min(mended, key=lambda mode: mode.cost)))
+            self.move_on()
+
+    def _unslipped(self, mode: Mode) -> Mode:
+        """The mode with one slip after the other taken back, while that may still improve the best."""
+        for _ in range(self.problem.limits.slips):
+            if len(taken := _slips(mode)) == 0 or self._is_hopeless(mode):
+                break
+            mode = self._doubted(next(slips.propose_turning_back(mode, taken)))
+        return mode
+
+    def _is_hopeless(self, mode: Mode) -> bool:
+        return mode.cost > self.modes[0].cost + _REGAINED * int(self.modes[0].is_false.sum())
+
+    def _search_from(self, mode: Mode) -> None:
+        """Continues the search from a mode as if it were the best."""
+        if self._is_hopeless(mode):
+            return
+        others, self.modes = self.modes, [mode]
+        self.move_on()
+        for other in others:
+            self.keep(other)
+
+    def _doubted(self, proposal: Proposal) -> Mode:
+        """The best of the modes that a proposal leads to, with closures of little evidence doubted."""
+        mode = self._made(proposal)
+        doubts = () if "doubts" in self.problem.without or self._is_hopeless(mode) else propose_doubts(mode)
+        return min((mode, *map(self._made, doubts)), key=lambda mode: mode.cost)
+
+    def _made(self, proposal: Proposal) -> Mode:
+        """The mode that a proposal leads to, which is kept."""
+        mode = self.flipped(self.polished(proposal.make(), proposal.name))
+        self.keep(mode)
+        return mode
 
     def _begun(self, name: str, state: State) -> Mode:
         """The mode of a start, begun with the noise of the best mode so far; the first start estimates its own."""
@@ -109,8 +160,7 @@ class Search:
                 if self._tried >= self.problem.limits.tried:
                     break
                 self._tried += 1
-                found = self.flipped(self.polished(proposal.make(), proposal.name))
-                self.keep(found)
+                found = self._made(proposal)
                 if found.cost < mode.cost - _GAIN:
                     break
             if self._next(done) is None:
@@ -165,7 +215,13 @@ class Search:
 
 def _has_slipped(mode: Mode) -> bool:
     """Whether odometry slipped, or would have slipped with narrower tails."""
-    return len(mode.slipped) > 0 or hides_slips(mode)
+    return len(_slips(mode)) > 0
+
+
+def _slips(mode: Mode) -> np.ndarray:
+    """Odometry that slipped, and that would have slipped with narrower tails, along the path."""
+    edges = np.union1d(mode.slipped, hidden_slips(mode))
+    return np.asarray(edges[np.argsort(mode.problem.graph.span[0, edges], kind="stable")])
 
 
 def proposals(mode: Mode) -> Iterator[Proposal]:
@@ -174,6 +230,8 @@ def proposals(mode: Mode) -> Iterator[Proposal]:
     if "settling" not in without:
         yield from propose_settling(mode)
         yield from noise.propose_worse_odometry(mode)
+    if "doubts" not in without:
+        yield from propose_doubts(mode)
     if "rejected-runs" not in without:
         yield from propose_rejected_runs(mode)
     if "joins" not in without:

@@ -318,7 +318,7 @@ STRUCTURAL = {
     "densities": {"_QUARTER_TURN"},
     "em": {"_SETTLED_TURN", "_MAX_UNSETTLED", "_SLOWEST", "_PROBABILITY_CONVERGED"}
     | {"_NEWTON_STEPS", "_NEWTON_CONVERGED", "_FARTHEST"},
-    "inference": {"_GAIN", "_BEAM"},
+    "inference": {"_GAIN", "_BEAM", "_REGAINED"},
     "labels/prior": {"_SHARES", "_STAY", "_LAST_SHARES", "_LOG_STEPS", "_DIGITS"},
     "labels/false_closures": {
         "_RUN_SHARES",
@@ -337,6 +337,7 @@ STRUCTURAL = {
     "publishing/gravity": {"_COMPONENTS", "_SOLVES", "_CONVERGED"},
     "publishing/modes": {"_FAR", "_FAR_NOISE", "LIKELY", "FAR_TURN", "_SURELY_FALSE", "_ROUNDS"} | {"_SCORED"},
     "publishing/notes": {"_FAR_SLIP", "_WORTH_A_WORD"},
+    "moves/doubts": {"_WEAK", "_LEAST_MEMBERS"},
     "moves/flips": {"_PART", "_DECIDED", "_HOPE", "_LEAST_GAIN"},
     "mode": {"OTHER_NOISE", "_SAME", "_MAX_DENSE"},
     "moves/joins": {"_MAX_TRIED"},

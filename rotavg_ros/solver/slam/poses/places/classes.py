@@ -41,7 +41,6 @@ class Said:
         axes: ``(C, m, m)`` those axes of even shifts, in columns.
         anywhere: ``(C, m)`` metres and m² of shifts, marginal over turns, likewise.
         is_told: ``(C,)`` bool, whether anything that may be right predicts them.
-        is_join: ``(C,)`` bool, whether they join two chains of odometry.
     """
 
     predictions: Predictions
@@ -55,7 +54,6 @@ class Said:
     axes: np.ndarray
     anywhere: tuple[np.ndarray, np.ndarray]
     is_told: np.ndarray
-    is_join: np.ndarray
 
     @classmethod
     def of(
@@ -83,7 +81,7 @@ class Said:
         variance = _variances(scale, priors)
         anywhere, is_told = along_axes(predictions.wrong, turns), predictions.tell(turns, scale.extent) & is_joined
         shifts = along, spread, here.axes, anywhere
-        return cls(predictions, turns, scale, turned, variance, log_turn, *shifts, is_told, ~told.is_within)
+        return cls(predictions, turns, scale, turned, variance, log_turn, *shifts, is_told)
 
     @cached_property
     def total(self) -> np.ndarray:
@@ -100,12 +98,11 @@ class Said:
     def log_anywhere(self) -> np.ndarray:
         """``(C,)`` nats, log densities of shifts that lead anywhere on the map.
 
-        Between two chains of odometry it is the mean of a normal density over its own values, wherever they lie. Itself
-        it would draw chains together that false closures join at random, since all of these are shorter then.
+        The mean of a normal density over its own values, wherever the ends lie. Itself it would draw together what
+        false closures join at random, since all of these are shorter then.
         """
-        (along, spread), variance = self.anywhere, self.scale.anywhere
-        wherever = -(np.log(2 * np.pi * variance) + 1) * along.shape[1] / 2
-        return np.where(self.is_join, wherever, log_normal(along, spread + variance[:, None]))
+        components = self.anywhere[0].shape[1]
+        return np.asarray(-(np.log(2 * np.pi * self.scale.anywhere) + 1) * components / 2)
 
     @cached_property
     def log_in_place(self) -> np.ndarray:

@@ -179,7 +179,15 @@ def log_labelled(mode: Mode, is_false: np.ndarray, residual: np.ndarray | None =
 
 def propose_mending(mode: Mode) -> Iterator[Proposal]:
     """Proposes to take each slip back: turn all behind it, or the part up to the next slip, or let odometry bend."""
-    slipped = mode.slipped
+    yield from propose_turning_back(mode, mode.slipped)
+    for edge in mode.slipped[: mode.problem.limits.slips]:
+        bends = -float(mode.left_out.log_odds[edge])
+        bend = partial(_bent, mode, int(edge))
+        yield Proposal("mend and bend", bends - OPTIMISM, bend, mode.problem.limits.slack)
+
+
+def propose_turning_back(mode: Mode, slipped: np.ndarray) -> Iterator[Proposal]:
+    """Proposes to take each of some slips back by turning all behind it, or the part up to the next one."""
     before, slack = rough_cost(mode.problem, mode.state), mode.problem.limits.slack
     for number, edge in enumerate(slipped[: mode.problem.limits.slips]):
         following = int(slipped[number + 1]) if number + 1 < len(slipped) else None
@@ -188,8 +196,6 @@ def propose_mending(mode: Mode) -> Iterator[Proposal]:
                 state = _mended(mode, int(edge), end)
                 predicted = rough_cost(mode.problem, state) - before - OPTIMISM
                 yield Proposal(name, predicted, partial(settle, mode.problem, state, SETTLING), slack)
-        bends = -float(mode.left_out.log_odds[edge])
-        yield Proposal("mend and bend", bends - OPTIMISM, partial(_bent, mode, int(edge)), slack)
 
 
 def propose_shifts(mode: Mode) -> Iterator[Proposal]:

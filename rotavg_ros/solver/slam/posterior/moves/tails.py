@@ -33,21 +33,21 @@ def propose_tails(mode: Mode) -> Iterator[Proposal]:
         yield Proposal("tails", mended.predicted, lambda: mended.state(mode), mode.problem.limits.rival)
 
 
-def hides_slips(mode: Mode) -> bool:
-    """Whether some segment in wide tails would clearly be a slip if tails had the smallest ratio of the grid.
+def hidden_slips(mode: Mode) -> np.ndarray:
+    """Segments in wide tails that would clearly be slips if tails had the smallest ratio of the grid.
 
-    Its error is as large as a slip's, so the part between two such segments may be turned, as between two slips.
+    Their errors are as large as a slip's, so the part between two such segments may be turned, as between two slips.
     """
     noise, problem, told = mode.state.noise, mode.problem, mode.left_out
     if noise.step_tail_ratio == STEP_TAIL_RATIOS[0] or "slips" in problem.without:
-        return False
+        return np.zeros(0, dtype=np.int64)
     sound = np.flatnonzero(problem.graph.is_odometry & mode.state.is_good)
     own, k = variances(problem, noise)[sound], problem.components
     if_wide, if_narrow = (
         log_good(told.square[sound], own, told.predicted[sound], k, tails(problem, each).of(sound))[0]
         for each in (noise, replace(noise, step_tail_ratio=STEP_TAIL_RATIOS[0]))
     )
-    return bool((told.log_odds[sound] - (if_wide - if_narrow) < -problem.limits.rival).any())
+    return np.asarray(sound[told.log_odds[sound] - (if_wide - if_narrow) < -problem.limits.rival])
 
 
 class _Mended(NamedTuple):
