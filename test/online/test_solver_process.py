@@ -230,6 +230,18 @@ def test_a_copy_outlives_the_terminal_where_whoever_made_it_does():
     subprocess.run([sys.executable, "-c", ignoring + _WITH_A_COPY + code], check=True, timeout=120)
 
 
+def test_an_interrupt_while_the_copy_is_made_does_not_end_it():
+    interrupted = """\
+import os, signal
+set_handler = signal.signal
+def interrupted(*args):
+    os.kill(os.getpid(), signal.SIGINT)
+    return set_handler(*args)
+os.register_at_fork(after_in_child=lambda: setattr(signal, "signal", interrupted))
+"""
+    subprocess.run([sys.executable, "-c", interrupted + _WITH_A_COPY], check=True, timeout=120)
+
+
 @pytest.mark.parametrize(
     "end",
     [

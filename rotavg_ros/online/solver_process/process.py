@@ -77,7 +77,12 @@ class Forked:
         with theirs:
             # This side's end must not stay open in the fork, or it would not notice when this process ends.
             self._process = get_context("fork").Process(target=_serve_as_copy, args=(ours, theirs), daemon=True)
-            self._process.start()
+            # Nor may a Ctrl-C end the fork before it ignores them.
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                self._process.start()
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
         self.connection = Connection(ours.detach())
 
     @property

@@ -159,17 +159,21 @@ def contracted(graph: ViewGraph) -> tuple[ViewGraph, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "translations", "sigmas"),
+    ("kind", "seed", "translations", "sigmas"),
     [
-        ("grid: odometry worse in turns", False, 0.15),
-        ("drive: 26 closures, 16 agree with noise", True, 0.03),
-        pytest.param("hills: gyroscope bias, 30 % random", True, 0.05, marks=pytest.mark.large),
-        pytest.param("building: odometry worse in turns", True, 0.3, marks=pytest.mark.large),
+        ("grid: odometry worse in turns", 2, False, 0.15),
+        ("drive: 26 closures, 16 agree with noise", 3, True, 0.03),
+        pytest.param("hills: gyroscope bias, 30 % random", 3, True, 0.05, marks=pytest.mark.large),
+        pytest.param("building: odometry worse in turns", 3, True, 0.3, marks=pytest.mark.large),
     ],
 )
-def test_nor_does_it_of_odometry_that_errs_in_turns_or_whose_translations_count(kind, translations, sigmas):
-    """By how many standard deviations an orientation moves: by up to 5 where only the sum of the steps is kept."""
-    graph = next(drawings(stress.kinds((kind,), translations=translations), [3])).graph
+def test_nor_does_it_of_odometry_that_errs_in_turns_or_whose_translations_count(kind, seed, translations, sigmas):
+    """By how many standard deviations an orientation moves: by up to 5 where only the sum of the steps is kept.
+
+    Of drawings with one likeliest answer. Where two are within a nat (the first kind's seeds 3 and 4), either may be
+    the median that is published, and an orientation moves by one.
+    """
+    graph = next(drawings(stress.kinds((kind,), translations=translations), [seed])).graph
     left, kept = contracted(graph)
     assert graph.num_nodes - len(kept) > 150
     full, small = solve(graph), solve(left)
