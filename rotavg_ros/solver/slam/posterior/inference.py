@@ -215,12 +215,13 @@ class Search:
 
 def _has_slipped(mode: Mode) -> bool:
     """Whether odometry slipped, or would have slipped with narrower tails."""
-    return len(_slips(mode)) > 0
+    return len(mode.slipped) > 0 or len(hidden_slips(mode)) > 0
 
 
 def _slips(mode: Mode) -> np.ndarray:
-    """Odometry that slipped, and that would have slipped with narrower tails, along the path."""
+    """Odometry that slipped or would have with narrower tails, along the path, without what a label says."""
     edges = np.union1d(mode.slipped, hidden_slips(mode))
+    edges = edges[np.isfinite(mode.problem.log_odds[edges])]
     return np.asarray(edges[np.argsort(mode.problem.graph.span[0, edges], kind="stable")])
 
 
