@@ -219,10 +219,10 @@ def _has_slipped(mode: Mode) -> bool:
 
 
 def _slips(mode: Mode) -> np.ndarray:
-    """Odometry that slipped or would have with narrower tails, along the path, without what a label says."""
-    edges = np.union1d(mode.slipped, hidden_slips(mode))
-    edges = edges[np.isfinite(mode.problem.log_odds[edges])]
-    return np.asarray(edges[np.argsort(mode.problem.graph.span[0, edges], kind="stable")])
+    """Segments that slipped, or would have with narrower tails, along the path; none whose label a user has set."""
+    problem, edges = mode.problem, np.union1d(mode.slipped, hidden_slips(mode))
+    edges = edges[(edges < problem.graph.num_segments) & np.isfinite(problem.log_odds[edges])]
+    return np.asarray(edges[np.argsort(problem.graph.span[0, edges], kind="stable")])
 
 
 def proposals(mode: Mode) -> Iterator[Proposal]:

@@ -66,10 +66,10 @@ def test_closures_that_a_user_accepted_are_not_doubted() -> None:
 
 
 @pytest.mark.large
-def test_a_slip_that_only_false_closures_tell_of_is_taken_back() -> None:
-    """Two thousand keyframes; a thousand false closures made the last four hundred seem to be turned by a quarter."""
-    drawn = town(33, keyframes=2000, tail=400, closures=1000, false=1000, blocks=10)
-    solution = solve(drawn.graph)
+@pytest.mark.parametrize(("without", "is_right"), [("", True), ("~doubts,mending", False)])
+def test_a_turn_that_only_false_closures_tell_of_is_taken_back(without: str, is_right: bool) -> None:
+    """Two thousand keyframes; a thousand false closures make a step of 67° likely that 67 good ones contradict."""
+    drawn = town(31, keyframes=2000, tail=400, closures=1000, false=1000, blocks=10)
+    solution = solve(drawn.graph, method=f"neurora{without}")
     errors = orientation_errors(solution.body_from_world, orientations(drawn), drawn.graph.components())
-    assert float(np.degrees(errors.numpy()).mean()) < 4
-    assert not any("slipped" in warning for warning in solution.warnings)
+    assert (float(np.degrees(errors.numpy()).mean()) < 5) == is_right
