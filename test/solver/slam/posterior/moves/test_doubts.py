@@ -58,6 +58,14 @@ def test_closures_that_all_else_supports_are_not_doubted() -> None:
     assert not list(propose_doubts(where_single_flips_end(town(0, keyframes=300, tail=60, closures=150, false=0))))
 
 
+def test_weak_closures_that_the_rest_supports_without_each_other_are_not_doubted() -> None:
+    """Rejected together, each would come back at once."""
+    mode = where_single_flips_end(town(1, keyframes=300, tail=60, closures=150, false=30))
+    believed = mode.problem.closure[~mode.is_false]
+    assert (mode.left_out.log_odds[believed] < 5).sum() > 5
+    assert not list(propose_doubts(mode))
+
+
 def test_closures_that_a_user_accepted_are_not_doubted() -> None:
     drawn = town(0, keyframes=300, tail=60, closures=150, false=200)
     label = torch.from_numpy(np.where(drawn.graph.is_odometry.numpy(), 0, np.where(drawn.is_false, 2, 1)))
