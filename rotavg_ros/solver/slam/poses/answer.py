@@ -10,6 +10,8 @@ import torch
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
+from rotavg_ros.solver.slam.poses.closures import GOOD, Predictions
+from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.row_errors import bridge_variance, closure_turns, mean_over_axes, mean_turn
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.publishing.modes import FAR_TURN, LIKELY, median, warning_of_rivals
@@ -196,25 +198,35 @@ def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray
 def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
     """``(E,)`` each: probability that a closure is false, in rotation or place; that an edge's rotation is false."""
     problem, places, mode = pose.problem, pose.solved.places, pose.problem.mode
-    predictions = pose.solved.predictions
-    closure, k = mode.problem.closure, problem.turns
-    uneven = problem.told.uneven
+    closure = mode.problem.closure
     own = closure_turns(problem, pose.state.noise) * problem.even_turns.mean_square[closure]
-    turn = np.sqrt((predictions.turn(uneven) ** 2).sum(axis=1))
-    covariance = uneven @ predictions.covariance[:, :k, :k] @ uneven
-    predicted = np.trace(covariance, axis1=1, axis2=2) / k
-    part = own / (own + predicted)
-    exceeds = exceedance(part * turn, part * predicted, OUTLIER_ANGLE, k)
-    good = places.rotation_good
-    if_false = exceedance(turn, predicted, OUTLIER_ANGLE, k)
+    alike = own + np.radians(problem.priors.turned_deg) ** 2
+    right, wrong = pose.solved.predictions, pose.solved.predictions.wrong
+    exceeds = [_turns_too_far(problem, *each) for each in ((right, own), (wrong, alike), (right, np.inf))]
+    # Classes: right places, wrong ones that are seen nearly alike, and false rotations.
+    turned = np.stack(exceeds).repeat((GOOD, len(places.chance) - GOOD - 1, 1), axis=0)
     rotation = 1 - mode.state.trusted
-    rotation[closure] = good * exceeds + (1 - good) * if_false
+    rotation[closure] = (places.chance * turned).sum(axis=0)
     # A closure is an outlier if its error in rotation or place is too large, whatever its class.
-    turned = np.concatenate((np.broadcast_to(exceeds, (len(places.chance) - 1, len(exceeds))), if_false[None]))
     elsewhere = places.beyond(FALSE_CLOSURE_M) * problem.told.is_known
     score = np.zeros(len(rotation))
     score[closure] = (places.chance * (1 - (1 - turned) * (1 - elsewhere))).sum(axis=0)
     return score, rotation
+
+
+def _turns_too_far(problem: PoseProblem, predictions: Predictions, variance: np.ndarray | float) -> np.ndarray:
+    """``(C,)`` probability that a closure's turn errs by more than 10°.
+
+    Args:
+        problem: the graph.
+        predictions: of its residual, by all else.
+        variance: ``(C,)`` rad² per component, of its own error; infinite where nothing is known of it.
+    """
+    k, uneven = problem.turns, problem.told.uneven
+    turn = np.sqrt((predictions.turn(uneven) ** 2).sum(axis=1))
+    predicted = np.trace(uneven @ predictions.covariance[:, :k, :k] @ uneven, axis1=1, axis2=2) / k
+    part = 1 / (1 + predicted / variance)
+    return exceedance(part * turn, part * predicted, OUTLIER_ANGLE, k)
 
 
 def _scores_of_restated(pose: PoseMode, body_from_world: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, ...]:
