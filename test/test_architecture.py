@@ -182,7 +182,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
             *("solved", "state"),
         },
         "search": {"closures", "em", "places", "problem", "repeats", "row_errors", "rows", "solved"},
-        "answer": {"row_errors", "solved"},
+        "answer": {"closures", "problem", "row_errors", "solved"},
         "memory": {"answer", "closures", "em", "problem", "row_errors", "solved", "state"},
         "solve": {"answer", "em", "memory", "problem", "search", "solved"},
     },
