@@ -158,12 +158,13 @@ class _UndirectedEdges:
 def _cheapest_parallel_edges(graph: ViewGraph, cost: Tensor) -> _UndirectedEdges:
     source, target = graph.source.cpu().numpy(), graph.target.cpu().numpy()
     low, high = np.minimum(source, target), np.maximum(source, target)
-    costs = cost.detach().cpu().double().numpy()
-    order = np.lexsort((costs, high, low))
-    low, high = low[order], high[order]
-    first = np.ones(len(low), dtype=bool)
-    first[1:] = (np.diff(low) != 0) | (np.diff(high) != 0)
-    return _UndirectedEdges(low[first], high[first], costs[order][first], order[first])
+    costs, pair = cost.detach().cpu().double().numpy(), low * np.int64(graph.num_nodes) + high
+    order = np.argsort(pair, kind="stable")  # takes hardly any time where pairs are sorted already
+    is_first = np.diff(pair[order], prepend=-1) > 0
+    if not is_first.all():
+        order = np.lexsort((costs, pair))
+    order = order[is_first]
+    return _UndirectedEdges(low[order], high[order], costs[order], order)
 
 
 def _first_per_component(component: np.ndarray, priority: np.ndarray) -> np.ndarray:

@@ -247,6 +247,8 @@ class UncertaintyPriors:
 
     Attributes:
         samples: number of random samples; what is sampled of a standard deviation errs by 9 %.
+        first_samples: their number in well-knit components where these suffice.
+        sample_error: relative error of standard deviations by sampling at which they do.
         most_edges: with more edges in well-knit components, samples would take seconds, and none is stated.
         least_weight: weight of edges that are surely wrong, which keeps the graph connected.
         flagged: edges of lower scores are believed: the noise's variance is from their residuals.
@@ -254,6 +256,8 @@ class UncertaintyPriors:
     """
 
     samples: int = 64
+    first_samples: int = 8
+    sample_error: float = 0.01
     most_edges: int = 1_000_000
     least_weight: float = 1e-3
     flagged: float = 0.5

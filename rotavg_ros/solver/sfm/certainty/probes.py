@@ -12,12 +12,12 @@ def probe_signs(first: np.ndarray, second: np.ndarray, num_probes: int) -> np.nd
     share their signs; their number among the parallels is mixed in to keep them independent.
     """
     low, high = np.minimum(first, second).astype(np.uint64), np.maximum(first, second).astype(np.uint64)
-    order = np.lexsort((high, low))
-    same = np.zeros(len(low), dtype=np.int64)
-    repeated = (np.diff(low[order]) == 0) & (np.diff(high[order]) == 0)
-    run = np.arange(1, len(low))
-    start = np.maximum.accumulate(np.where(repeated, 0, run)) if len(low) > 1 else run
-    same[order[1:]] = np.where(repeated, run - start, 0)
+    pair = low.astype(np.int64) * (int(high.max(initial=0)) + 1) + high.astype(np.int64)
+    order = np.argsort(pair, kind="stable")  # takes hardly any time where pairs are sorted already
+    run = np.arange(len(pair))
+    start = np.maximum.accumulate(np.where(np.diff(pair[order], prepend=-1) > 0, run, 0))
+    same = np.empty_like(pair)
+    same[order] = run - start
     key = _mix(low * np.uint64(0x9E3779B97F4A7C15) ^ _mix(high ^ _mix(same.astype(np.uint64))))
     words = -(-num_probes // 64)
     bits = np.stack([_mix(key + np.uint64(word + 1)) for word in range(words)], axis=1).astype("<u8")

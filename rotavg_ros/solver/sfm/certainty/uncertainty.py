@@ -5,7 +5,7 @@ outlier, and σ² is the sum of the squared residuals of edges with a score belo
 are redundant. Noise is assumed round. Its diagonal
 is estimated from random samples of the answer. What a node's own edges contribute is known without any samples, and
 where nodes have many edges that is nearly all; there the samples come from conjugate gradients, without a
-factorisation.
+factorisation, and a few tell whether more are needed.
 """
 
 from __future__ import annotations
@@ -77,15 +77,16 @@ def variances(graph: ViewGraph, noise: Tensor, score: Tensor, bridge: Tensor, to
     turned[bridge] = score[bridge] * rotations.RANDOM_VARIANCE
     weight = 1 / (1 / weight + turned / noise[graph.source].clamp(min=PRIORS.least_noise))
     found = weight.new_full((graph.num_nodes,), torch.nan)
-    for chosen, sample in ((is_checked & is_loose, _by_factorisation), (is_checked & ~is_loose, _by_iterations)):
+    for chosen, relative in ((is_checked & is_loose, _in_loose), (is_checked & ~is_loose, _in_well_knit)):
         nodes = chosen[to.component]
         edges_of = nodes[graph.source].nonzero().squeeze(1)
         if not len(edges_of):
             continue
-        part, of_part = graph.select_edges(edges_of), weight[edges_of]
-        samples = sample(part, of_part, to)
-        if samples is not None:
-            found = torch.where(nodes, noise * _relative(part, of_part, samples, to), found)
+        is_whole = len(edges_of) == graph.num_edges
+        part = (graph, weight) if is_whole else (graph.select_edges(edges_of), weight[edges_of])
+        of_part = relative(*part, to)
+        if of_part is not None:
+            found = torch.where(nodes, noise * of_part, found)
     return None if bool(found.isnan().all()) else found
 
 
@@ -105,25 +106,38 @@ def noise_variance(graph: ViewGraph, angle: Tensor, score: Tensor, component: Te
     return square.new_zeros(count).index_add_(0, of_edge, square) / (3 * checks.clamp(min=1))
 
 
-def _relative(graph: ViewGraph, weight: Tensor, samples: _Samples, to: References) -> Tensor:
-    """Variances ``(N,)`` of nodes less their component's reference, in units of σ²; of nodes that have edges.
+class _Relative(NamedTuple):
+    """Variances of nodes less their component's reference, in units of σ²; of nodes that have edges.
 
-    With L x = f and D its diagonal, x = f / D + y, where y are the means of the neighbours' x. Since E f xᵀ = 1 up to a
-    constant, and E f fᵀ = L, of E (xᵥ − xᵣ)² all is known but E (yᵥ − yᵣ)².
+    Attributes:
+        variance: ``(N,)``.
+        sampled: ``(N,)`` the part of it that samples tell.
     """
-    reference = to.node[to.component]
-    degree, beside_reference = weight.new_zeros(2, graph.num_nodes).unbind()
-    for one, other in ((graph.source, graph.target), (graph.target, graph.source)):
-        degree.index_add_(0, one, weight)
-        beside_reference.index_add_(0, one, torch.where(other == reference[other], weight, 0.0))
-    of_others = samples.value - samples.force / degree[:, None]
-    variance = (of_others - of_others[reference]).square().mean(dim=1)
-    variance += 1 / degree + 1 / degree[reference] - 2 * beside_reference / (degree * degree[reference])
-    return variance.index_fill(0, to.node, 0.0)
+
+    variance: Tensor
+    sampled: Tensor
+
+    @classmethod
+    def of(cls, graph: ViewGraph, weight: Tensor, samples: _Samples, to: References) -> _Relative:
+        """By samples for these edges.
+
+        With L x = f and D its diagonal, x = f / D + y, where y are the means of the neighbours' x. Since E f xᵀ = 1 up
+        to a constant, and E f fᵀ = L, of E (xᵥ − xᵣ)² all is known but E (yᵥ − yᵣ)².
+        """
+        reference = to.node[to.component]
+        degree, beside_reference = weight.new_zeros(2, graph.num_nodes).unbind()
+        for one, other in ((graph.source, graph.target), (graph.target, graph.source)):
+            degree.index_add_(0, one, weight)
+            beside_reference.index_add_(0, one, torch.where(other == reference[other], weight, 0.0))
+        of_others = samples.value - samples.force / degree[:, None]
+        sampled = (of_others - of_others[reference]).square().mean(dim=1)
+        variance = sampled + 1 / degree + 1 / degree[reference]
+        variance -= 2 * beside_reference / (degree * degree[reference])
+        return cls(variance.index_fill(0, to.node, 0.0), sampled.index_fill(0, to.node, 0.0))
 
 
-def _by_factorisation(graph: ViewGraph, weight: Tensor, to: References) -> _Samples:
-    """Samples for the nodes that have edges, in loosely knit components."""
+def _in_loose(graph: ViewGraph, weight: Tensor, to: References) -> Tensor:
+    """Relative variances ``(N,)`` in loosely knit components; of nodes that have edges."""
     is_used = torch.zeros(graph.num_nodes, dtype=torch.bool, device=graph.device)
     is_used[graph.source] = is_used[graph.target] = True
     # Nodes whose variance is not needed are held fixed, like the references.
@@ -131,39 +145,55 @@ def _by_factorisation(graph: ViewGraph, weight: Tensor, to: References) -> _Samp
     fixed[to.node] = True
     ends = graph.source.cpu().numpy(), graph.target.cpu().numpy()
     system = LaplacianSystem(graph.num_nodes, *ends, weight.cpu().numpy(), fixed.nonzero().squeeze(1).cpu().numpy())
-    force = _forces(graph, weight, to)
-    return _Samples(force, torch.from_numpy(system.solve(force.cpu().numpy())).to(force))
+    force = _forces(graph, weight, to, PRIORS.samples)
+    samples = _Samples(force, torch.from_numpy(system.solve(force.cpu().numpy())).to(force))
+    return _Relative.of(graph, weight, samples, to).variance
 
 
-def _by_iterations(graph: ViewGraph, weight: Tensor, to: References) -> _Samples | None:
-    """Samples for the nodes that have edges, in well-knit components; None if the iterations do not converge."""
+def _in_well_knit(graph: ViewGraph, weight: Tensor, to: References) -> Tensor | None:
+    """Relative variances ``(N,)`` in well-knit components; of nodes that have edges.
+
+    None in graphs with more than a million edges, or where the iterations do not converge.
+    """
     if graph.num_edges > PRIORS.most_edges:
         return None
-    force = _forces(graph, weight, to)
-    value, is_solved = ScalarLaplacian(SortedEdges.of(graph), weight, to.component).solve(force.t().contiguous())
-    return _Samples(force, value.t()) if is_solved else None
+    laplacian = ScalarLaplacian(SortedEdges.of(graph), weight, to.component)
+    found, is_known = weight.new_zeros(graph.num_nodes), torch.zeros_like(to.node, dtype=torch.bool)
+    for count in (PRIORS.first_samples, PRIORS.samples):
+        force = _forces(graph, weight, to, count)
+        value, is_solved = laplacian.solve(force.t().contiguous())
+        if not is_solved:
+            return None
+        variance, sampled = _Relative.of(graph, weight, _Samples(force, value.t()), to)
+        found = torch.where(is_known[to.component], found, variance)
+        error = (2 / count) ** 0.5 / 2 * (sampled / variance).nan_to_num(0.0)
+        largest = error.new_zeros(len(to.node)).scatter_reduce(0, to.component, error, "amax")
+        is_known |= largest <= PRIORS.sample_error
+        if bool(is_known.all()):
+            break
+    return found
 
 
-def _forces(graph: ViewGraph, weight: Tensor, to: References) -> Tensor:
+def _forces(graph: ViewGraph, weight: Tensor, to: References, count: int) -> Tensor:
     """Random forces ``(N, k)`` on nodes whose second moments are L: Bᵀ W^½ times random signs."""
     ends = graph.source.cpu().numpy(), graph.target.cpu().numpy()
     root = weight.sqrt().cpu().numpy()
     incidence = incidence_matrix(graph.num_nodes, *ends).astype(root.dtype)
-    signs = _signs(*ends, to)
+    signs = _signs(*ends, to, count)
     # A few columns at a time: as floating-point numbers, all of them would take much memory.
-    parts = [incidence @ (root[:, None] * few) for few in np.array_split(signs, range(8, PRIORS.samples, 8), axis=1)]
+    parts = [incidence @ (root[:, None] * few) for few in np.array_split(signs, range(8, count, 8), axis=1)]
     return torch.from_numpy(np.concatenate(parts, axis=1)).to(weight)
 
 
-def _signs(source: np.ndarray, target: np.ndarray, to: References) -> np.ndarray:
+def _signs(source: np.ndarray, target: np.ndarray, to: References, count: int) -> np.ndarray:
     """Random signs ``(M, k)`` of edges, for each component as if it were alone."""
     component = to.component.cpu().numpy()
     first = np.full(len(to.node), len(component))
     np.minimum.at(first, component, np.arange(len(component)))
     of_edge = component[source]
-    signs = np.empty((len(source), PRIORS.samples), dtype=np.int8)
+    signs = np.empty((len(source), count), dtype=np.int8)
     order = np.argsort(of_edge, kind="stable")
     for members in np.split(order, np.flatnonzero(np.diff(of_edge[order])) + 1):
         start = first[of_edge[members[0]]]
-        signs[members] = probe_signs(source[members] - start, target[members] - start, PRIORS.samples)
+        signs[members] = probe_signs(source[members] - start, target[members] - start, count)
     return signs

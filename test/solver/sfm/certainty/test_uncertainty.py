@@ -121,6 +121,31 @@ def test_each_component_states_its_own() -> None:
         assert torch.allclose(stated[nodes], solve(alone, profile="sfm").uncertainty, rtol=0.02)
 
 
+def test_a_few_samples_are_taken_where_they_suffice() -> None:
+    """As exact where cameras have 150 edges as where they have 16, and neither depends on the other."""
+    sizes, degrees = (200, 60), (150, 16)
+    graphs = [
+        measured(random_truth(size, 3), *_dense(size, degree)) for size, degree in zip(sizes, degrees, strict=True)
+    ]
+    ends = (torch.cat((getattr(graphs[0], end), getattr(graphs[1], end) + sizes[0])) for end in ("source", "target"))
+    relative = torch.cat([graph.target_from_source for graph in graphs])
+    together = ViewGraph.create(*ends, relative, num_nodes=sum(sizes))
+
+    def stated(graph: ViewGraph, nodes: list[int]) -> np.ndarray:
+        component, first = torch.arange(len(nodes)).repeat_interleave(torch.tensor(nodes)), np.cumsum([0, *nodes[:-1]])
+        to = uncertainty.References(component, torch.from_numpy(first))
+        noise, score = _NOISE.repeat(len(nodes)), torch.zeros(graph.num_edges, dtype=torch.float64)
+        found = uncertainty.variances(graph, noise, score, torch.zeros(0, dtype=torch.int64), to)
+        assert found is not None
+        return found.numpy()
+
+    parts = np.split(stated(together, list(sizes)), sizes[:1])
+    for graph, part, tolerance in zip(graphs, parts, (0.01, 0.05), strict=True):
+        exact = float(_NOISE) * _exact(graph, np.ones(graph.num_edges))
+        assert np.allclose((part[1:] / exact) ** 0.5, 1, atol=tolerance)
+        assert np.allclose(part, stated(graph, [graph.num_nodes]), rtol=1e-6)
+
+
 def test_well_knit_graphs_with_too_many_edges_state_none(monkeypatch: pytest.MonkeyPatch) -> None:
     graph = measured(random_truth(60, 7), *_GRAPHS["well knit"])
     assert bool(solve(graph, profile="sfm").uncertainty.isfinite().all())
