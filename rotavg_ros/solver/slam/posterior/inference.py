@@ -127,7 +127,11 @@ class Search:
         return mode
 
     def _begun(self, name: str, state: State) -> Mode:
-        """The mode of a start, begun with the noise of the best mode so far; the first start estimates its own."""
+        """The mode of a start, begun with the noise of the best mode so far; the first start estimates its own.
+
+        Labels may need other noise than those of the best mode: if closures across an uneven stretch are held false,
+        nothing shows that it is uneven.
+        """
         if self.modes:
             best = self.modes[0]
             state = step(self.problem, with_noise(self.problem, state, best.state.noise)).state
@@ -135,6 +139,8 @@ class Search:
                 return best
             mode = self.flipped(self.polished(state, name))
             self.keep(mode)
+            if mode.cost - noise.promised(mode) < self.modes[0].cost + self.problem.limits.rival:
+                self._tune(mode)
             return mode
         mode = self.flipped(self.polished(state, name))
         self.keep(mode)

@@ -52,10 +52,8 @@ _FIRST_SOLVES = 2
 def tuned(mode: Mode) -> Iterator[Mode]:
     """Modes of the same labels under other noise: one grid after the other, each from the best noise so far."""
     begun = mode
-    for names, grid in _GRIDS.items():
-        if not _tells(mode, names[0]):
-            continue
-        left = [values for values in grid if values != _values(mode, names) and _is_open(mode.problem, names, values)]
+    for names in _GRIDS:
+        left = _other_values(mode, names)
         while left:
             chosen = _next(mode, names, left)
             if chosen is None:
@@ -66,6 +64,16 @@ def tuned(mode: Mode) -> Iterator[Mode]:
             mode = min(mode, found, key=lambda either: either.cost)
     if mode is not begun:
         yield _polished(mode, mode.state.noise)
+
+
+def promised(mode: Mode) -> float:
+    """Largest decrease of F, nats, predicted for the labels of a mode under other values of one grid."""
+    least = 0.0
+    for names in _GRIDS:
+        if names not in _JOINT:
+            predicted = (_predicted(mode, _with(mode, names, values))[0] for values in _other_values(mode, names))
+            least = min(least, min(predicted, default=0.0))
+    return -least
 
 
 def propose_worse_odometry(mode: Mode) -> Iterator[Proposal]:
@@ -99,6 +107,18 @@ def _values(mode: Mode, names: tuple[str, ...]) -> _Values:
     return tuple(getattr(mode.state.noise, name) for name in names)
 
 
+def _other_values(mode: Mode, names: tuple[str, ...]) -> list[_Values]:
+    """The values of a grid that a mode does not have, if the graph has information on them."""
+    if not _tells(mode, names[0]):
+        return []
+    now = _values(mode, names)
+    return [values for values in _GRIDS[names] if values != now and _is_open(mode.problem, names, values)]
+
+
+def _with(mode: Mode, names: tuple[str, ...], values: _Values) -> Noise:
+    return replace(mode.state.noise, **dict(zip(names, values, strict=True)))
+
+
 def _is_open(problem: Problem, names: tuple[str, ...], values: _Values) -> bool:
     """Whether a combination of values is switched on."""
     is_wide = "step_tail_ratio" in names and values[-1] > STEP_TAIL_RATIOS[0]
@@ -112,7 +132,7 @@ def _next(mode: Mode, names: tuple[str, ...], left: list[_Values]) -> tuple[_Val
     If none qualifies, tails adjacent to the current ones on the grid are tried: other tails change the prediction of
     each edge, which the predicted F neglects.
     """
-    noise = {values: replace(mode.state.noise, **dict(zip(names, values, strict=True))) for values in left}
+    noise = {values: _with(mode, names, values) for values in left}
     if names in _JOINT:
         return left[0], noise[left[0]]
     predicted = {values: _predicted(mode, each) for values, each in noise.items()}
