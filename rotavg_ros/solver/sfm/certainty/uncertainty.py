@@ -2,7 +2,7 @@
 
 It is the least-squares covariance σ² L⁻¹ of the believed edges: each is weighted by the probability that it is no
 outlier, and σ² is the sum of the squared residuals of edges with a score below one half over the number of those that
-are redundant. Noise is assumed round. Its diagonal
+are redundant among themselves. Noise is assumed round. Its diagonal
 is estimated from random samples of the answer. What a node's own edges contribute is known without any samples, and
 where nodes have many edges that is nearly all; there the samples come from conjugate gradients, without a
 factorisation, and a few tell whether more are needed.
@@ -101,8 +101,11 @@ def noise_variance(graph: ViewGraph, angle: Tensor, score: Tensor, component: Te
     """
     count, is_believed = int(component.max()) + 1, score < PRIORS.flagged
     of_edge, square = component[graph.source[is_believed]], angle[is_believed].to(score).square()
-    # Number of believed edges beyond a spanning tree, at least one.
-    checks = torch.bincount(of_edge, minlength=count) - torch.bincount(component, minlength=count) + 1
+    part = graph.components(is_believed).to(component)
+    of_part = torch.empty_like(part[: int(part.max()) + 1]).index_copy_(0, part, component)
+    # Number of believed edges beyond a spanning forest of them, at least one.
+    edges, nodes, parts = (torch.bincount(each, minlength=count) for each in (of_edge, component, of_part))
+    checks = edges - nodes + parts
     return square.new_zeros(count).index_add_(0, of_edge, square) / (3 * checks.clamp(min=1))
 
 

@@ -77,11 +77,12 @@ def polish(
 
     Args:
         problem: the graph.
-        state: where to begin.
+        state: where to begin; labels that a user has set hold, whatever it has.
         solves: maximum number, exceeded only while a solve still gains much; default: that of the limits.
         hold_noise: leave the noise as it is.
     """
     enough = problem.limits.polish_solves if solves is None else solves
+    state = replace(state, trusted=problem.allowed(state.trusted))
     last, gained = np.zeros(2), np.inf
     for number in range(problem.limits.polish_solves):
         if number >= enough and gained < problem.limits.rival:

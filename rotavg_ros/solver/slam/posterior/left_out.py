@@ -58,8 +58,8 @@ def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> Lef
     label_odds = label_log_odds(problem, is_false)
     odds[closure] = label_odds - np.log(told_false)
     odometry = np.flatnonzero(graph.is_odometry)
-    slips = int((~state.is_good[odometry]).sum())
-    odds[odometry] -= log_slip_odds(problem, graph.own_steps[odometry], slips)
+    slipped = ~state.is_good[odometry]
+    odds[odometry] -= log_slip_odds(problem, graph.own_steps[odometry], slipped.sum() - slipped)
     odds[odometry] -= log_slipped(square[odometry], own[odometry], predicted[odometry], k, priors)
 
     if_good = log_good(k * (own + predicted), own, predicted, k, tails(problem, state.noise))[0]

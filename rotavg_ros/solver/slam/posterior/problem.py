@@ -190,6 +190,10 @@ class Problem:
         """``(C,)`` number of each closure's run, for the largest length of runs."""
         return runs_of(self.graph, self.chain, RUN_STEPS[-1])
 
+    def allowed(self, trusted: np.ndarray) -> np.ndarray:
+        """Labels ``(E,)``, 1 where a user has accepted an edge and 0 where one was rejected, whatever they were."""
+        return np.where(np.isinf(self.log_odds), self.log_odds > 0, trusted)
+
     def system(self, noise: Noise) -> NormalEquations:
         """Normal equations; runs of two or more closures have a common error."""
         if noise.run_steps not in self._systems:

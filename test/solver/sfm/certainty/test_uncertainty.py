@@ -106,6 +106,20 @@ def test_false_edges_do_not_count_as_noise(noise_deg: float) -> None:
     assert 0.25 < np.mean(ratios) < 1.3
 
 
+def test_noise_is_told_by_the_part_that_believed_edges_join() -> None:
+    """25 cameras see some others each; to each hangs one more by a false edge, which says nothing of the noise."""
+    source, target = _dense(25, 4)
+    residual = small_noise(len(source), 1.0, 0).as_rotvec()
+    incidence = np.zeros((len(source), 25))
+    incidence[np.arange(len(source)), source], incidence[np.arange(len(source)), target] = -1, 1
+    residual -= incidence @ np.linalg.lstsq(incidence, residual, rcond=None)[0]
+    graph = measured(random_truth(50, 3), np.append(source, np.arange(25)), np.append(target, np.arange(25, 50)))
+    angle = torch.from_numpy(np.append(np.linalg.norm(residual, axis=1), np.ones(25)))
+    score = torch.from_numpy(np.repeat([0.0, 0.9], [len(source), 25]))
+    (deviation,) = uncertainty.noise_variance(graph, angle, score, torch.zeros(50, dtype=torch.int64)).sqrt()
+    assert float(deviation) == pytest.approx(np.radians(1.0), rel=0.2)
+
+
 def test_each_component_states_its_own() -> None:
     """A well-knit one, a street and a tree state what they state alone."""
     dense, tree = _dense(40, 20), (100 + np.arange(8), 101 + np.arange(8))

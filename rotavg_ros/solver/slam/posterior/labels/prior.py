@@ -122,8 +122,8 @@ def log_slip_prior(problem: Problem, slipped: np.ndarray) -> float:
     return float(prior - betaln(priors.slip_count, priors.slip_steps) + np.log(steps).sum())
 
 
-def log_slip_odds(problem: Problem, steps: np.ndarray, slips: int) -> np.ndarray:
-    """Prior log-odds that segments of ``steps`` ``(n,)`` slipped, given that ``slips`` others have."""
+def log_slip_odds(problem: Problem, steps: np.ndarray, slips: int | np.ndarray) -> np.ndarray:
+    """Prior log-odds that segments of ``steps`` ``(n,)`` slipped, given that ``slips`` others have, one or ``(n,)``."""
     priors = problem.priors
     rate = (priors.slip_count + slips) / (priors.slip_steps + problem.total_steps)
     return np.asarray(np.log(rate * np.maximum(steps, 1.0)))

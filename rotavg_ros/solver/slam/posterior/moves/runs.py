@@ -1,7 +1,8 @@
 """Moves that reject a whole run: good closures that support each other although all other edges contradict them.
 
-For K closures of a run with residuals r, variances V (diagonal) and covariance R of their fitted values, all other
-edges predict their discrepancies y as N(0, S):
+For K closures of a run with residuals r, weights V⁻¹ in the solve (diagonal; 1 / V is less than the inverse variance of
+a closure that is in the tails) and covariance R of their fitted values, all other edges predict their discrepancies y
+as N(0, S):
 
     y = V (V − R)⁻¹ r,    S = V (V − R)⁻¹ V.
 """
@@ -62,7 +63,7 @@ def _without(mode: Mode, members: np.ndarray) -> tuple[float, np.ndarray] | None
     """
     problem, k = mode.problem, mode.problem.components
     rows, sign = problem.closure[members], problem.sign[members, None]
-    own = variances(problem, mode.state.noise)[rows]
+    own = 1 / mode.evaluation.weight[rows]
     left = np.diag(own) - mode.covariance_of(members) * sign * sign.T
     try:
         factor = np.linalg.cholesky(left)

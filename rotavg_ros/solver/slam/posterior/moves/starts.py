@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.spanning_forest import compose_orientations, shortest_path_forest
+from rotavg_ros.solver.slam.graph.evenly import evenly
 from rotavg_ros.solver.slam.noise.model import NoiseModel, agree, noise_between_neighbours
 from rotavg_ros.solver.slam.posterior.em import settle
 from rotavg_ros.solver.slam.posterior.left_out import relabelled
@@ -46,6 +47,8 @@ _ANNEALED_SLIPS = (0.5, 0.01)
 _LEAST_WEIGHT = 1e-9
 # Closures between two chains agree if their turns differ by less than this, rad, to allow for the chains' drift.
 _SAME_TURN = np.radians(15.0)
+# Maximum number of closures between two chains of which it is counted how many agree with each.
+_MAX_TRIED = 256
 
 
 def starts(problem: Problem, prepared: Prepared, cleaned: CleanedClosures, tree: Tensor) -> Iterator[tuple[str, State]]:
@@ -57,13 +60,12 @@ def starts(problem: Problem, prepared: Prepared, cleaned: CleanedClosures, tree:
         cleaned: CleanNet's verdict on its closures.
         tree: corrections ``(K, 4)`` along CleanNet's tree, or of an earlier answer.
     """
-    noise = initial_noise(prepared.noise)
-    joined = _joined_chains(problem)
-    everything = np.ones(len(problem.graph.source))
+    noise, everything = initial_noise(prepared.noise), _all_good(problem)
     yield "tree", settle(problem, at(problem, tree, cleaned.inlier_probability, noise))
     if "robust-start" not in problem.without:
         yield "robust start", _robust(problem, at(problem, tree, everything, noise))
     if "annealing" not in problem.without:
+        joined = _joined_chains(problem)
         for step_variance, closure_variance in _prior_levels(problem.priors):
             level = replace(noise, step_variance=step_variance, closure_variance=closure_variance)
             yield "annealing", annealed(problem, at(problem, tree if joined is None else joined, everything, level))
@@ -73,7 +75,7 @@ def turned_parts(problem: Problem, prepared: Prepared, tree: Tensor) -> State:
     """A state with parts turned by minimum cuts where odometry seems to have slipped, with labels that then follow."""
     near = noise_between_neighbours(prepared.pairs, problem.components)
     found = _turned_parts(problem, prepared, tree, near)
-    return _labelled(problem, at(problem, found, np.ones(0), initial_noise(near)))
+    return _labelled(problem, at(problem, found, _all_good(problem), initial_noise(near)))
 
 
 def turned_further(problem: Problem, prepared: Prepared, state: State) -> State:
@@ -83,7 +85,7 @@ def turned_further(problem: Problem, prepared: Prepared, state: State) -> State:
     )
     correction = torch.from_numpy(np.ascontiguousarray(state.correction.T))
     found = _turned_parts(problem, prepared, correction, noise, anneal=False)
-    return _labelled(problem, at(problem, found, np.ones(0), state.noise))
+    return _labelled(problem, at(problem, found, _all_good(problem), state.noise))
 
 
 def initial_noise(model: NoiseModel) -> Noise:
@@ -92,28 +94,35 @@ def initial_noise(model: NoiseModel) -> Noise:
 
 
 def at(problem: Problem, correction: Tensor, trusted: np.ndarray, noise: Noise) -> State:
-    """A state at corrections ``(K, 4)``."""
+    """A state at corrections ``(K, 4)``, with labels ``(E,)``; those that a user has set hold."""
     rows = np.ascontiguousarray(correction.numpy().T)
     common = np.zeros((problem.system(noise).num_runs, 3))
-    return State(rows, common, trusted.astype(np.float64), noise, Others.before_any(len(problem.graph.source)))
+    trusted = problem.allowed(trusted.astype(np.float64))
+    return State(rows, common, trusted, noise, Others.before_any(len(problem.graph.source)))
+
+
+def _all_good(problem: Problem) -> np.ndarray:
+    """Labels ``(E,)`` of which all are good."""
+    return np.ones(len(problem.graph.source))
 
 
 def annealed(problem: Problem, state: State) -> State:
     """Graduated non-convexity (Yang et al. 2020, truncated least squares) on closures, odometry trusted."""
     variance, closure, system = variances(problem, state.noise), problem.closure, problem.system(state.noise)
-    told = problem.log_odds[closure]
+    may_count = problem.log_odds[closure] > -np.inf
     limit = _INLIER_SQUARE[problem.components]
     sharpness = 0.0
     while sharpness < _SHARP:
         residual = residuals(problem, state)
         square = (residual**2).sum(axis=1)[closure] / variance[closure]
         if sharpness == 0:
-            sharpness = limit / max(2 * float(square.max(initial=0.0)) - limit, _LEAST_WEIGHT)
+            largest = float(square.max(initial=0.0, where=may_count))
+            sharpness = limit / max(2 * largest - limit, _LEAST_WEIGHT)
         else:
             weight = np.sqrt(limit * sharpness * (sharpness + 1) / np.maximum(square, _LEAST_WEIGHT)) - sharpness
             trusted = state.trusted.copy()
-            trusted[closure] = np.where(np.isinf(told), told > 0, np.clip(weight, 0.0, 1.0))
-            state = replace(state, trusted=trusted)
+            trusted[closure] = np.clip(weight, 0.0, 1.0)
+            state = replace(state, trusted=problem.allowed(trusted))
             sharpness *= problem.limits.annealing_factor
         trust = np.concatenate((state.trusted, np.ones(system.num_runs)))
         state = moved(state, system.factorise(np.maximum(trust, _LEAST_WEIGHT) / variance).fit(residual))
@@ -136,7 +145,7 @@ def _joined_chains(problem: Problem) -> Tensor | None:
     graph, closure = problem.graph, problem.closure
     _, chain = np.unique(graph.chain, return_inverse=True)
     ends = np.stack((chain[graph.source[closure]], chain[graph.target[closure]]))
-    between = np.flatnonzero(ends[0] != ends[1])
+    between = np.flatnonzero((ends[0] != ends[1]) & (problem.log_odds[closure] > -np.inf))
     if len(between) == 0:
         return None
     # A closure u → v between chains says C_v ≈ e C_u for all nodes of both; all are stated from the lower chain on.
@@ -144,14 +153,21 @@ def _joined_chains(problem: Problem) -> Tensor | None:
     turned = np.where(ends[0, between] < ends[1, between], turned, quaternion_rows.inverse(turned))
     low, high = np.sort(ends[:, between], axis=0)
     count = int(chain.max()) + 1
-    agrees = (np.abs(turned.T @ turned) > np.cos(_SAME_TURN / 2)) & (low[:, None] == low) & (high[:, None] == high)
-    votes = agrees.sum(axis=1)
-    order = np.lexsort((-votes, high, low))
-    _, first = np.unique(low[order] * count + high[order], return_index=True)
-    best = order[first]
+    pair = low * count + high
+    order = np.argsort(pair, kind="stable")
+    most = [_agreed_by_most(turned, of) for of in np.split(order, np.flatnonzero(np.diff(pair[order])) + 1)]
+    best, votes = np.array(most).T
     chains = ViewGraph.create(low[best], high[best], torch.from_numpy(turned[:, best].T.copy()), num_nodes=count)
-    forest = shortest_path_forest(chains, torch.from_numpy(1.0 / votes[best] ** 2), root="first")
+    forest = shortest_path_forest(chains, torch.from_numpy(1.0 / votes**2), root="first")
     return compose_orientations(forest, chains)[torch.from_numpy(chain)]
+
+
+def _agreed_by_most(turned: np.ndarray, closures: np.ndarray) -> tuple[int, int]:
+    """Which of some closures ``(n,)`` most of them agree with, and with how many; ``turned`` is ``(4, C)``."""
+    tried = evenly(closures, _MAX_TRIED)
+    votes = (np.abs(turned[:, tried].T @ turned[:, closures]) > np.cos(_SAME_TURN / 2)).sum(axis=1)
+    best = int(votes.argmax())
+    return int(tried[best]), int(votes[best])
 
 
 def _robust(problem: Problem, state: State) -> State:
@@ -160,6 +176,7 @@ def _robust(problem: Problem, state: State) -> State:
     for _ in range(problem.limits.robust_solves):
         residual = residuals(problem, state)
         weight = (1 + (residual**2).sum(axis=1) / own) ** _ROBUST_POWER / own
+        weight[: len(state.trusted)] *= np.maximum(state.trusted, _LEAST_WEIGHT)
         state = moved(state, problem.system(state.noise).factorise(weight).fit(residual))
     return _labelled(problem, state)
 

@@ -43,7 +43,7 @@ class Published:
         variance: ``(N,)`` rad², of the view-graph's nodes.
         noise: noise of the likeliest labelling.
         chosen: index of the mode whose orientations are published, the median.
-        rivals: probabilities of the averaged labellings, the best first.
+        rivals: probabilities of the averaged labellings, the best first; those under other noise after all others.
         warnings: given where rivals are likely and differ.
     """
 
@@ -89,7 +89,7 @@ def publish(problem: Problem, modes: list[Mode], tuned: Callable[[Mode], Mode] =
         off = np.sqrt((turn**2).sum(axis=0) / k)
         spread = (1 - graph.fraction) * off[graph.above] + graph.fraction * off[graph.below]
         variance += weight * (answer.variance + spread**2)
-    warnings = _warnings(problem, rivals, share, turns)
+    warnings = warnings_of(problem, rivals, share, turns, middle)
     number = next(number for number, mode in enumerate(modes) if mode is rivals[middle])
     # Shares add up to one up to rounding.
     score, of_restated = (np.clip(each, 0.0, 1.0) for each in (score, of_restated))
@@ -109,17 +109,27 @@ def median(corrections: list[np.ndarray], share: np.ndarray) -> int:
     return int(np.argmin(angle @ share))
 
 
-def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: list[np.ndarray]) -> tuple[str, ...]:
-    """Warnings about the differences between rivals, if a likely one turns a part of the map by far."""
+def warnings_of(
+    problem: Problem, rivals: list[Mode], share: np.ndarray, turns: list[np.ndarray], chosen: int
+) -> tuple[str, ...]:
+    """Warnings about the differences of rivals from the chosen one, if a likely one turns a part of the map by far.
+
+    Args:
+        problem: the graph.
+        rivals: labellings.
+        share: ``(n,)`` their probabilities.
+        turns: of each, ``(3, K)`` rad from the chosen one's orientations.
+        chosen: the index of that.
+    """
     largest = [float(np.sqrt((turn**2).sum(axis=0)).max(initial=0.0)) for turn in turns]
     others = [
         number
-        for number in range(1, len(rivals))
-        if share[number] >= LIKELY and largest[number] > FAR_TURN and not rivals[number].is_like(rivals[0].state)
+        for number in range(len(rivals))
+        if share[number] >= LIKELY and largest[number] > FAR_TURN and not rivals[number].is_like(rivals[chosen].state)
     ]
     if not others:
         return ()
-    differs = np.any([rivals[number].state.is_good != rivals[0].state.is_good for number in others], axis=0)
+    differs = np.any([rivals[number].state.is_good != rivals[chosen].state.is_good for number in others], axis=0)
     closures, steps = int(differs[problem.closure].sum()), int(differs[problem.graph.is_odometry].sum())
     turned = np.degrees(max(largest[number] for number in others))
     change = f"turn parts of the map by up to {turned:.0f}°"

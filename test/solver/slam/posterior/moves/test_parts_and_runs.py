@@ -15,6 +15,7 @@ from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.moves.runs import propose_rejected_runs
 from rotavg_ros.solver.slam.posterior.moves.splits import propose_splits
 from rotavg_ros.solver.slam.posterior.moves.starts import at, initial_noise
+from rotavg_ros.solver.slam.posterior.publishing.modes import warnings_of
 from rotavg_ros.solver.slam.posterior.solve import Drawn
 from test.solver.graphs import as_quaternions, measured, random_truth, small_noise
 
@@ -80,23 +81,38 @@ def test_one_slip_that_was_two_is_split(taken: int, other: int) -> None:
     assert len(found.slipped) == 2
 
 
-def test_a_run_that_holds_itself_good_is_rejected_as_one() -> None:
-    """Each is what the others predict; no single flip lowers F."""
+@pytest.mark.parametrize(("off_deg", "closure_tails"), [(4.0, 0.0), (14.0, 0.02), (14.0, 0.1)])
+def test_a_run_that_holds_itself_good_is_rejected_as_one(off_deg: float, closure_tails: float) -> None:
+    """Each is what the others predict, or in the tails; no single flip lowers F."""
     count = LAP // 2 * len(np.triu_indices(LAPS, 1)[0])
     closures = np.arange(count)
     # The last lap's closures with the first one, at eight places.
     is_run = np.isin(closures // 6, np.arange(6, 14)) & (closures % 6 == 2)
-    graph, truth = laps({}, is_run, 4.0)
+    graph, truth = laps({}, is_run, off_deg)
     drawn = Drawn.of(graph, None)
     begun = mode_at(drawn, truth, [])
     problem = drawn.problem
     trusted = begun.state.trusted.copy()
     trusted[problem.closure] = 1.0
-    held = Search(problem).polished(replace(begun.state, trusted=trusted), "held")
+    noise = replace(begun.state.noise, closure_tails=closure_tails)
+    held = Search(problem).polished(replace(begun.state, trusted=trusted, noise=noise), "held")
     best = min(propose_rejected_runs(held), key=lambda proposal: proposal.predicted)
     found = Search(problem).polished(best.make(), best.name)
     assert best.predicted < -5
     assert found.cost - held.cost < best.predicted + 5
+
+
+def test_a_rival_is_told_of_though_it_is_the_likeliest() -> None:
+    """What is published is the median, here the second."""
+    graph, truth = laps({FIRST: 45.0})
+    drawn = Drawn.of(graph, None)
+    beyond = np.arange(len(truth)) > FIRST
+    turned = truth * Rotation.from_rotvec(np.radians(45.0) * beyond[:, None] * [0, 0, 1])
+    rivals = [mode_at(drawn, truth, [FIRST]), mode_at(drawn, turned, []), mode_at(drawn, turned, [])]
+    turns = [np.zeros((3, drawn.problem.graph.num_nodes)) for _ in rivals]
+    turns[0][2, -1] = np.radians(45.0)
+    (warning,) = warnings_of(drawn.problem, rivals, np.array([0.4, 0.3, 0.3]), turns, 1)
+    assert "nearly as likely (40 %)" in warning and "up to 45°" in warning
 
 
 def test_nothing_is_proposed_where_nothing_slipped_and_nothing_is_false() -> None:
