@@ -57,7 +57,13 @@ def clean(network: SlamCleanNet | None, prepared: Prepared, label: Tensor) -> Cl
     good[graph.is_closure], prior[graph.is_closure] = judge_closures(
         network, noise, prepared.squared_angle, prepared.path_steps, prepared.pairs
     )
-    edge_label = label.numpy()[graph.view_graph_edge]
+    told = label.numpy()
+    # A segment may slip in any step but those that a user has accepted.
+    on_segment = graph.segment_of_edge >= 0
+    is_open = told[on_segment] != EdgeLabel.ACCEPTED
+    may_slip = np.bincount(graph.segment_of_edge[on_segment], is_open, minlength=graph.num_segments) > 0
+    prior[: graph.num_segments][~may_slip] = np.inf
+    edge_label = told[graph.view_graph_edge]
     verdict = np.select([edge_label == EdgeLabel.ACCEPTED, edge_label == EdgeLabel.REJECTED], [np.inf, -np.inf], 0.0)
     good[graph.num_segments :] = np.where(verdict == 0, good[graph.num_segments :], verdict)
     prior[graph.num_segments :] = np.where(verdict == 0, prior[graph.num_segments :], verdict)

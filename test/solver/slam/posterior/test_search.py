@@ -299,7 +299,7 @@ def test_labels_decide() -> None:
     assert (float(score[good]), float(score[false])) == (1.0, 0.0)
 
 
-@pytest.mark.parametrize("seed", [1, 6, 13])
+@pytest.mark.parametrize("seed", [7, 11, 18])
 def test_what_a_user_has_rejected_counts_for_nothing(seed: int) -> None:
     """Even where all else fits so well that no closure is doubted, and it alone says where the last keyframe is."""
     older = np.append(np.arange(0, 25, 2), 5)

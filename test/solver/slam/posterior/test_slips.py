@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros import EdgeKind, ViewGraph, rotations, solve
+from rotavg_ros import EdgeKind, EdgeLabel, ViewGraph, rotations, solve
 from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.evaluation.common.contenders import contenders
 from rotavg_ros.evaluation.common.scoring import score_all
@@ -71,6 +71,18 @@ def test_slips_and_false_closures_are_told_apart(planar: bool, false_share: floa
     assert not any("slipped" in warning for warning in without.warnings)
     errors = orientation_errors(without.body_from_world, as_quaternions(truth), graph.components())
     assert np.degrees(float(errors.mean())) > 5
+
+
+@pytest.mark.parametrize("is_accepted", [False, True])
+def test_odometry_that_a_user_has_accepted_does_not_slip(is_accepted: bool) -> None:
+    """Though a slip there is what all closures tell of."""
+    graph = laps(planar=False, false_share=0.0, slips={25: 50.0})[0]
+    label = graph.label.clone()
+    label[25] = int(EdgeLabel.ACCEPTED if is_accepted else EdgeLabel.AUTOMATIC)
+    turns = solve(replace(graph, label=label), profile="slam").body_from_world[25:27]
+    step = rotations.multiply(turns[1], rotations.inverse(turns[0]))
+    off = rotations.angle(rotations.multiply(step, rotations.inverse(graph.target_from_source[25])))
+    assert (np.degrees(float(off)) < 2.0) == is_accepted
 
 
 def test_what_is_advised_is_not_what_was_done_already() -> None:
