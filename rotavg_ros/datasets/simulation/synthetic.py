@@ -16,12 +16,11 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from rotavg_ros import rotations
 from rotavg_ros.view_graph import ViewGraph
 
 # Noise beyond which the paper calls an edge an outlier.
 SFM_OUTLIER_ANGLE = np.radians(20.0)
-# rad², variance per component of the rotation vector of a uniformly random rotation: (π²/3 + 2) / 3.
-_ANY_ROTATION = (np.pi**2 / 3 + 2) / 3
 # Beyond this many cameras a list of all pairs takes gigabytes.
 _MAX_NODES_TO_LIST_PAIRS = 4000
 
@@ -193,7 +192,9 @@ class PaperRecipe:
         noise = Rotation.from_rotvec(rotvec).as_quat()
         replaced = rng.choice(m, int(rng.uniform(*self.outlier_share) * m), replace=False)
         noise[replaced] = _random_quaternions(len(replaced), rng)
-        covariance = _covariance(sigma**2 * _axis_moment(self.planar), _ANY_ROTATION * np.eye(3), replaced, m)
+        covariance = _covariance(
+            sigma**2 * _axis_moment(self.planar), rotations.RANDOM_VARIANCE * np.eye(3), replaced, m
+        )
         return EdgeNoise(Rotation.from_quat(noise), covariance)
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.online.answer.gauge import component_roots
 from rotavg_ros.online.graph.snapshot import GraphSnapshot
 from rotavg_ros.solver.solution import angles_off, distances_off
 from rotavg_ros.view_graph import EdgeLabel
@@ -197,9 +198,7 @@ def _in_gauge(solution: Solution, body_from_world: Tensor) -> NDArray[np.float64
     if solution.position is None:
         return None
     component = solution.component.cpu()
-    first = torch.full((int(component.max()) + 1,), len(component))
-    first = first.scatter_reduce(0, component, torch.arange(len(component)), "amin")
-    turn = rotations.inverse(body_from_world[first])[component]
+    turn = rotations.inverse(body_from_world[component_roots(component)])[component]
     return np.asarray(rotations.rotate(turn, solution.position.cpu()).numpy())
 
 

@@ -9,6 +9,7 @@ import torch
 from scipy.special import expit
 from torch import Tensor
 
+from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.spanning_forest import compose_orientations, shortest_path_forest
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
@@ -20,7 +21,7 @@ from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # For the tree: the least probability that a closure is false, and the mean squared error, rad², of a false one.
 _MIN_DISTRUST = 0.02
-_FALSE_SQUARE = np.pi**2 / 3 + 2
+_FALSE_SQUARE = 3 * rotations.RANDOM_VARIANCE
 # Share of the network's log-odds that the posterior adds to its own: only a part, since both use some of the same
 # evidence; less the more closures are false, since agreement by chance is then as common as agreement of good ones.
 _NETWORK_SHARE = 0.6

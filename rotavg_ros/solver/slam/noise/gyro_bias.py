@@ -31,7 +31,8 @@ _MAX_PROPOSALS = 60
 # More closures than this do not improve an estimate of three numbers.
 _MAX_CLOSURES = 1500
 _EM_ITERATIONS = 10
-# Prior standard deviation of a component of the bias, rad per step.
+# Prior standard deviation of a component of the bias, rad per step. The estimate is only where Newton steps of the
+# posterior begin; F has a prior of its own.
 _PRIOR_BIAS = np.radians(1.0)
 
 

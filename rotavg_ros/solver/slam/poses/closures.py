@@ -30,8 +30,6 @@ _DIMENSIONS = 3
 _TOLD = 0.5
 # rad² per component of a turn about which nothing is known.
 ANYHOW = np.pi**2 / 3
-# Number of closures detected before (and after) one with which it is compared.
-_WINDOW = 48
 
 
 @dataclass(frozen=True)
@@ -203,7 +201,7 @@ class Told:
             in_order: only those before.
         """
         is_one = None if in_order else np.isin(rows, tells)
-        return Near(rows, tells, places_near(self.detected[tells], self.detected[rows], is_one, _WINDOW))
+        return Near(rows, tells, places_near(self.detected[tells], self.detected[rows], is_one))
 
 
 @dataclass(frozen=True)

@@ -96,7 +96,7 @@ class Search:
 
     def _unslipped(self, mode: Mode) -> Mode:
         """The mode with one slip after the other taken back, while that may still improve the best."""
-        for _ in range(self.problem.limits.slips):
+        for _ in range(self.problem.limits.candidates):
             if len(taken := _slips(mode)) == 0 or self._is_hopeless(mode):
                 break
             mode = self._doubted(next(slips.propose_turning_back(mode, taken)))

@@ -1,4 +1,4 @@
-"""All prior parameters of the posterior, and all bounds of its search, in two frozen classes."""
+"""Prior parameters of the posterior, and bounds of its search, in two frozen classes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from dataclasses import dataclass
 class SlamPriors:
     """Prior parameters for a robot's graph. Angles are in degrees, per component of a rotation.
 
-    Rates that are not listed here (the share of repeated turns, the stickiness of labels) are integrated over a grid,
-    see :mod:`rotavg_ros.solver.slam.posterior.labels`.
+    Not here are grids: of rates that are integrated (the share of repeated turns, the stickiness of labels,
+    :mod:`rotavg_ros.solver.slam.posterior.labels`), and of noise that F chooses
+    (:mod:`rotavg_ros.solver.slam.posterior.state`). What bounds a density (the length of a stretch of bad odometry, the
+    share of turns about the vertical) stands beside it.
 
     Attributes:
         step_deg: median of the standard deviation of one step of odometry.
@@ -80,8 +82,8 @@ class SearchLimits:
         tried: maximum number of moves that are tried.
         slack: nats; a move is tried if F is predicted to rise by no more than this.
         rival: nats; moves are also tried from modes whose F is within this of the best.
-        slips: number of places that are examined for a slip.
-        window: number of false closures before (and after) one with which it is compared.
+        candidates: number of slips, runs, parts or joins that a move proposes at most, the most promising first; and of
+            slips that are taken back one after the other.
         averaged: maximum number of labellings that are averaged.
     """
 
@@ -96,6 +98,5 @@ class SearchLimits:
     tried: int = 60
     slack: float = 1.0
     rival: float = 6.0
-    slips: int = 12
-    window: int = 48
+    candidates: int = 12
     averaged: int = 8

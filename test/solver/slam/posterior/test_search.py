@@ -390,7 +390,7 @@ STRUCTURAL = {
         "SAME_PLACE",
     },
     "moves/starts": {"_INLIER_SQUARE", "_SHARP", "_STEP_LEVELS", "_CLOSURE_LEVEL", "_ROBUST_POWER"}
-    | {"_ANNEALED_SLIPS", "_LEAST_WEIGHT", "_SAME_TURN"},
+    | {"_ANNEALED_SLIPS", "_LEAST_WEIGHT", "_SAME_TURN", "_MAX_TRIED"},
     # A cost by which a start is found; F alone decides what becomes of it.
     "moves/truncated_cost": {"_SLACK", "_SETTLING_STEPS", "_ANNEALING_FACTOR", "_COARSE_FACTOR", "_COARSE_CONVEXITY"}
     | {"_DESCENT_STEPS", "_SETTLED_STEP", "_UNEVEN_SHARE", "_UNEVEN_RATIO", "_MAX_SLIP", "_COSINE_OF_MAX_SLIP"}

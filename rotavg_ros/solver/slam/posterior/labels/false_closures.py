@@ -230,7 +230,7 @@ def false_density(
     is_told = predicted < _TOLD * anyhow(k)
     false = problem.detection[is_false[problem.detection]]
     is_one = is_false[rows] if both_sides else None
-    between = places_near(problem.detected[false], problem.detected[rows], is_one, problem.limits.window)
+    between = places_near(problem.detected[false], problem.detected[rows], is_one)
     closures, near = Closures(older, newer, turn, is_told), Near(rows, false, between)
     return FalseDensity(alone, repeats(closures, near, problem.priors.run_gap_steps, k), run)
 

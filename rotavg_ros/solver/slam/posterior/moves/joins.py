@@ -39,7 +39,7 @@ def propose_joins(mode: Mode) -> Iterator[Proposal]:
     low, high = np.sort(ends, axis=0)
     variance = mode.state.noise.closure_variance + mode.state.others.predicted[closure]
     before = rough_cost(problem, mode.state)
-    for _ in range(problem.limits.slips):
+    for _ in range(problem.limits.candidates):
         if not is_left.any():
             break
         left = np.flatnonzero(is_left)

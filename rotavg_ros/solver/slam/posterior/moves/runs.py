@@ -29,7 +29,7 @@ _LEAST_MEMBERS = 2
 def propose_rejected_runs(mode: Mode) -> Iterator[Proposal]:
     """Proposes to reject the runs of good closures whose residuals have the largest common part."""
     problem, limits = mode.problem, mode.problem.limits
-    runs = _runs(mode)[: limits.slips]
+    runs = _runs(mode)[: limits.candidates]
     if not runs:
         return
     residual = mode.evaluation.residual[problem.closure]
@@ -53,7 +53,7 @@ def _runs(mode: Mode) -> list[np.ndarray]:
     square = (total**2).sum(axis=1) / np.maximum(np.bincount(problem.run, own * is_good), np.finfo(np.float64).tiny)
     order = np.argsort(-square, kind="stable")
     chosen = order[np.bincount(problem.run, is_good)[order] >= _LEAST_MEMBERS]
-    return [np.flatnonzero(is_good & (problem.run == run)) for run in chosen[: problem.limits.slips]]
+    return [np.flatnonzero(is_good & (problem.run == run)) for run in chosen[: problem.limits.candidates]]
 
 
 def _without(mode: Mode, members: np.ndarray) -> tuple[float, np.ndarray] | None:

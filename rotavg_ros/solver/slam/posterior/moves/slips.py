@@ -95,7 +95,7 @@ class Witnesses:
 def propose_slips(mode: Mode) -> Iterator[Proposal]:
     """Proposes slips where one turn makes at least two false closures good."""
     witnesses = Witnesses.of(mode)
-    places = _places(mode, witnesses)[: mode.problem.limits.slips]
+    places = _places(mode, witnesses)[: mode.problem.limits.candidates]
     before = log_labelled(mode, mode.is_false) if places else 0.0
     for _, closure, place, freed, lost in places:
         edge, turn = int(witnesses.segment[place]), witnesses.turned[:, [closure]]
@@ -180,7 +180,7 @@ def log_labelled(mode: Mode, is_false: np.ndarray, residual: np.ndarray | None =
 def propose_mending(mode: Mode) -> Iterator[Proposal]:
     """Proposes to take each slip back: turn all behind it, or the part up to the next slip, or let odometry bend."""
     yield from propose_turning_back(mode, mode.slipped)
-    for edge in mode.slipped[: mode.problem.limits.slips]:
+    for edge in mode.slipped[: mode.problem.limits.candidates]:
         bends = -float(mode.left_out.log_odds[edge])
         bend = partial(_bent, mode, int(edge))
         yield Proposal("mend and bend", bends - OPTIMISM, bend, mode.problem.limits.slack)
@@ -189,7 +189,7 @@ def propose_mending(mode: Mode) -> Iterator[Proposal]:
 def propose_turning_back(mode: Mode, slipped: np.ndarray) -> Iterator[Proposal]:
     """Proposes to take each of some slips back by turning all behind it, or the part up to the next one."""
     before, slack = rough_cost(mode.problem, mode.state), mode.problem.limits.slack
-    for number, edge in enumerate(slipped[: mode.problem.limits.slips]):
+    for number, edge in enumerate(slipped[: mode.problem.limits.candidates]):
         following = int(slipped[number + 1]) if number + 1 < len(slipped) else None
         for name, end in (("mend and reject", None), ("turn a part back", following)):
             if end is not None or name == "mend and reject":
@@ -210,7 +210,7 @@ def propose_shifts(mode: Mode) -> Iterator[Proposal]:
     chain = graph.chain[graph.source]
     before = rough_cost(mode.problem, mode.state)
     slipped = mode.slipped[mode.slipped < graph.num_segments]
-    for edge in slipped[: limits.slips]:
+    for edge in slipped[: limits.candidates]:
         (at,) = np.flatnonzero(order == edge)
         for place in (at + side * far for far in range(1, _FARTHEST_SHIFT + 1) for side in (-1, 1)):
             other = int(order[place]) if 0 <= place < len(order) else -1

@@ -65,8 +65,8 @@ def propose_splits(mode: Mode) -> Iterator[Proposal]:
         return
     limits, witnesses, before = mode.problem.limits, Witnesses.of(mode), rough_cost(mode.problem, mode.state)
     groups = list(_groups(mode, witnesses))
-    parts = [part for slip in slipped[: limits.slips] for part in _parts(mode, witnesses, groups, int(slip))]
-    for part in sorted(parts, key=lambda part: -part.gained)[: limits.slips]:
+    parts = [part for slip in slipped[: limits.candidates] for part in _parts(mode, witnesses, groups, int(slip))]
+    for part in sorted(parts, key=lambda part: -part.gained)[: limits.candidates]:
         state = _split(mode, part)
         predicted = rough_cost(mode.problem, state) - before - OPTIMISM
         yield Proposal("split", predicted, partial(settle, mode.problem, state, SETTLING), limits.slack)
