@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
                 "one of the two options out"
             )
         arguments.method = methods.without(*arguments.without)
-    jobs = plan(arguments.graphs, arguments.output, poses=arguments.poses)
+    jobs = plan(arguments.graphs, arguments.output, arguments.edges, poses=arguments.poses)
     solve_graph: Callable[[ViewGraph], Solution] = partial(
         solve,
         method=arguments.method,
@@ -131,12 +131,12 @@ def solve_file(job: Job, solver: _Warm, edges: str, *, poses: bool = False) -> d
     return summary
 
 
-def plan(graphs: list[Path], output: Path, *, poses: bool = False) -> list[Job]:
+def plan(graphs: list[Path], output: Path, edges: str, *, poses: bool = False) -> list[Job]:
     """Where each answer goes, after all checks that are possible before any work.
 
     Raises:
-        SolveError: two graphs with one stem, an output folder that cannot be written, or a graph that an
-            output would overwrite.
+        SolveError: two graphs with one stem, an output folder that cannot be written, or a file that an answer would
+            overwrite though it is no earlier one's.
     """
     graph_at = {os.path.realpath(graph): graph for graph in reversed(graphs)}
     jobs = [Job(graph, output if len(graphs) == 1 else output / stem_of(graph)) for graph in graphs]
@@ -146,33 +146,43 @@ def plan(graphs: list[Path], output: Path, *, poses: bool = False) -> list[Job]:
         if other is not job.graph:
             raise SolveError(f"{other} and {job.graph} would both go to {job.output}; solve them one by one")
         _check_writable(job.output)
-        edge_files = (f"{_EDGES}.{suffix}" for suffix in EDGE_FORMATS)
-        pose_files = POSE_FILES if poses else _older_pose_files(job.output)
-        for name in (_ORIENTATIONS, _SUMMARY, *edge_files, *pose_files):
-            with asking_about(job.output / name, SolveError):
-                is_folder = (job.output / name).is_dir()
-            overwritten = graph_at.get(os.path.realpath(job.output / name))
+        older, written = _older_files(job.output), _possible_files(edges, poses=poses)
+        for name in sorted(older | written):
+            path = job.output / name
+            with asking_about(path, SolveError):
+                exists, is_folder = path.exists(), path.is_dir()
+            overwritten = graph_at.get(os.path.realpath(path))
             if overwritten is not None:
                 raise SolveError(f"{overwritten} would be overwritten by the answer; choose another --output")
             if is_folder:
-                raise SolveError(f"{job.output / name} is a folder; remove it or choose another --output")
+                raise SolveError(f"{path} is a folder; remove it or choose another --output")
+            if exists and name not in older:
+                raise SolveError(
+                    f"{path} would be overwritten, though no earlier answer there lists it as its own; move it away or "
+                    "choose another --output"
+                )
     return jobs
 
 
 def _files(graph_file: GraphFile, edges: str, *, poses: bool) -> list[str]:
     """Names of an answer's files."""
-    names = [_ORIENTATIONS, _SUMMARY]
-    names += [] if edges == "none" else [f"{_EDGES}.{edges}"]
-    return sorted(names + (pose_files(graph_file) if poses else []))
+    return sorted(_possible_files(edges) | set(pose_files(graph_file) if poses else []))
 
 
-def _older_pose_files(folder: Path) -> list[str]:
-    """The pose files listed in a folder's summary, so that another program's graph.g2o is left alone."""
+def _possible_files(edges: str, *, poses: bool = False) -> set[str]:
+    """Names of the files that an answer may have."""
+    own = {_ORIENTATIONS, _SUMMARY, *(POSE_FILES if poses else ())}
+    return own if edges == "none" else own | {f"{_EDGES}.{edges}"}
+
+
+def _older_files(folder: Path) -> set[str]:
+    """The files that the summary of an earlier answer lists, so that another program's graph.g2o is left alone."""
     try:
         names = json.loads((folder / _SUMMARY).read_text(encoding="utf-8"))["files"]
     except (OSError, ValueError, KeyError, TypeError):
-        return []
-    return [name for name in POSE_FILES if name in names] if isinstance(names, list) else []
+        return set()
+    possible = set().union(*(_possible_files(suffix, poses=True) for suffix in EDGE_FORMATS))
+    return possible.intersection(names) if isinstance(names, list) and _SUMMARY in names else set()
 
 
 def summarize(
@@ -221,7 +231,7 @@ def write_answer(output: Path, graph_file: GraphFile, solution: Solution, summar
     temporary = {name: output / f".{name}.{os.getpid()}.tmp" for name in writers}
     try:
         output.mkdir(parents=True, exist_ok=True)
-        older = {f"{_EDGES}.{suffix}" for suffix in EDGE_FORMATS} | set(_older_pose_files(output))
+        older = _older_files(output)
         for name, write in writers.items():
             with temporary[name].open("wb") as file:
                 write(file)

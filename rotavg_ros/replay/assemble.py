@@ -19,7 +19,7 @@ from rotavg_ros.replay.feed import Feed, read_references
 from rotavg_ros.replay.frames import BagFrames
 from rotavg_ros.replay.mounting import without_mounting
 from rotavg_ros.replay.plan import Input, Plan
-from rotavg_ros.replay.record import Reference, RobotRecord, RunRecord
+from rotavg_ros.replay.record import Reference, RobotRecord, RunRecord, positions_told
 from rotavg_ros.replay.run import Outcome, Window, bounds
 
 _IMU = "sensor_msgs/msg/Imu"
@@ -147,4 +147,4 @@ def _from_file(path: Path, keyframes_ns: NDArray[np.int64], odometry_ns: NDArray
                 f"({first_ns / 1e9:.1f} … {last_ns / 1e9:.1f} s)"
             )
             raise GraphFileError.at(path, None, what)
-    return Reference(path.name, stamps_ns, poses.world_from_body, poses.position, time_line)
+    return Reference(path.name, stamps_ns, poses.world_from_body, positions_told(poses.position), time_line)

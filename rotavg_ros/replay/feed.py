@@ -26,7 +26,7 @@ from rotavg_ros.online.odometry.time_jumps import KEEPS_TIME_LINE, BackwardJumps
 from rotavg_ros.online.quaternion import IDENTITY, Quaternion
 from rotavg_ros.replay.frames import BagFrames
 from rotavg_ros.replay.plan import Input, Plan
-from rotavg_ros.replay.record import Reference
+from rotavg_ros.replay.record import Reference, positions_told
 from rotavg_ros.settings.parameters import NodeParameters
 
 # Called with the robot and its odometry whenever the estimator has taken a message of it.
@@ -118,12 +118,11 @@ def _reference(name: str, records: list[OdometryRecord], options: EstimatorOptio
     length = np.linalg.norm(orientation, axis=1)
     is_last = np.concatenate(((np.diff(stamp_ns) > 0) | (np.diff(time_line) > 0), [True]))[: len(records)]
     sound = np.isfinite(length) & (length > 0) & is_last
-    has_position = bool(np.isfinite(position[sound]).all(axis=1).any())
     return Reference(
         name,
         stamp_ns[sound],
         orientation[sound] / length[sound, None],
-        position[sound] if has_position else None,
+        positions_told(position[sound]),
         time_line[sound] if time_line.any() else None,
     )
 

@@ -49,6 +49,15 @@ class TopicUse:
     why_not: str = ""
 
 
+def positions_told(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Positions ``(r, 3)``, NaN rows where unknown; None if none is known, or all are the same.
+
+    A message has no way to say that its sender knows orientations alone, so such senders leave all positions at zero.
+    """
+    known = position[np.isfinite(position).all(axis=1)]
+    return position if len(known) and bool(np.ptp(known, axis=0).any()) else None
+
+
 @dataclass(frozen=True)
 class Reference:
     """A robot's poses from another source (r poses, ascending stamps): ground truth, or a check.

@@ -199,9 +199,26 @@ def test_the_plan_looks_at_every_graph_once(tmp_path: Path, monkeypatch: pytest.
     counts = []
     for number in (10, 20):
         looked.clear()
-        plan([tmp_path / f"{index}.g2o" for index in range(number)], tmp_path / "out")
+        plan([tmp_path / f"{index}.g2o" for index in range(number)], tmp_path / "out", "csv")
         counts.append(len(looked))
     assert counts[1] == 2 * counts[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), [("edges.csv", []), ("summary.json", []), ("edges.npz", ["--edges", "npz"])]
+)
+def test_what_no_answer_has_written_is_not_overwritten(
+    graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, options: list[str]
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / name).write_text("somebody's own")
+    assert main(["solve", str(graph_path), "--output", str(out), *options]) == 2
+    assert f"{name} would be overwritten, though no earlier answer" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == [name] and (out / name).read_text() == "somebody's own"
+    (out / name).unlink()
+    for _ in range(2):
+        assert main(["solve", str(graph_path), "--output", str(out), *options]) == 0
 
 
 def test_installed_command(graph_path: Path, tmp_path: Path) -> None:

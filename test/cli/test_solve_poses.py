@@ -57,8 +57,13 @@ def test_an_older_answers_poses_go_and_others_graphs_stay(tmp_path: Path, capsys
     out = tmp_path / "out"
     out.mkdir()
     (out / "graph.g2o").write_text("somebody's own")
+    assert main(["solve", str(tmp_path / "run.g2o"), "--output", str(out)]) == 0
+    assert main(["solve", str(tmp_path / "run.g2o"), "--poses", "--output", str(out)]) == 2
+    assert "graph.g2o would be overwritten" in capsys.readouterr().err
+    assert (out / "graph.g2o").read_text() == "somebody's own"
+    (out / "graph.g2o").unlink()
     for words, names in (
-        (["run.g2o"], {"graph.g2o"}),
+        (["run.g2o"], set()),
         (["run.npz", "--poses"], {"graph.g2o", "trajectory.kitti", "trajectory.tum"}),
         (["run.g2o", "--poses"], {"graph.g2o", "trajectory.kitti"}),
         (["run.npz"], set()),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -17,9 +18,13 @@ from evo.tools import file_interface
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+from rotavg_ros.bags.graph_to_bag import write_graph_bag
 from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 from rotavg_ros.settings.parameters import PARAMETERS
+
+from .conftest import SELDOM
 
 EVERYTHING = {
     "/abs_orientations": "rotavg_msgs/msg/AbsoluteOrientations",
@@ -156,3 +161,12 @@ def test_the_last_recorded_answer_is_the_one_in_the_tables(replayed: Path) -> No
     tum = np.loadtxt(replayed / "trajectory.tum")
     path = [pose.pose.position for pose in last["/corrected_path"].poses]
     np.testing.assert_allclose([[point.x, point.y, point.z] for point in path], tum[:, 1:4], atol=1e-6)
+
+
+def test_a_reference_of_orientations_alone_judges_no_positions(run: SimulatedRun, tmp_path: Path) -> None:
+    """A pose message cannot say that its position is unknown: such references stay at the origin."""
+    write_graph_bag(tmp_path / "bag", replace(run.to_graph_file(), position_gt=None))
+    assert main(["replay", str(tmp_path / "bag"), "--output", str(tmp_path / "out"), "--no-report", *SELDOM]) == 0
+    (robot,) = json.loads((tmp_path / "out" / "summary.json").read_text())["robots"].values()
+    assert robot["orientation_error_mean_deg"]["corrected"] < 5
+    assert "position_error_rms_m" not in robot
