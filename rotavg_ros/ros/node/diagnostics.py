@@ -17,6 +17,8 @@ from rotavg_ros.view_graph import EdgeKind
 
 # An answer that lags behind the graph by more solve periods than this is stale.
 _STALE_PERIODS = 10
+# Until the first answer this many seconds pass as patience: on a new machine code is compiled, about a minute if idle.
+_FIRST_ANSWER_S = 300.0
 # Ticks longer ago than this say nothing about the present load.
 _RECENT_S = 60.0
 # Robots' names come from messages and may be anything; only this many are shown.
@@ -35,6 +37,7 @@ BEGAN_ANEW = (
     "a front end sends other odometry between keyframes whose ids the graph has: if it was started again, none of what "
     "it sends now is about the robot's present way; call ~/reset"
 )
+FIRST_ANSWER = "the first answer is being worked out; once on a machine code is compiled for it, a minute or two"
 # Refusals that occur in a healthy system, where senders repeat themselves.
 _HARMLESS = {"duplicate_edge", "marginalized_keyframe"}
 
@@ -67,6 +70,9 @@ class Reporter:
         if counts.time_is_back:
             errors.append("time went back and odometry is refused since; call ~/reset to begin anew")
         warnings = [*health.mistakes, *_of_waiting(counts, parameters), *_warnings(health, parameters, now)]
+        waited = _waited_long(health, parameters, paused, now)
+        if waited is not None and _may_compile(health, waited):
+            warnings.append(f"{FIRST_ANSWER}, since {waited:.0f} s")
         if counts.queued:
             warnings.append(f"more closures came at once than a tick takes in: {counts.queued} wait to be solved")
         if counts.is_full:
@@ -105,10 +111,21 @@ def _errors(health: Health, parameters: NodeParameters, paused: bool, now: float
     errors = []
     if health.failure is not None:
         errors.append(f"solving fails: {health.failure}")
-    patience = _STALE_PERIODS * max(parameters.solve_period_s, 1e-3 * _finite(health.ticks.percentile_ms(95)))
-    if health.unsolved_since is not None and not paused and now - health.unsolved_since > patience:
-        errors.append(f"the answer is stale by {now - health.unsolved_since:.0f} s")
+    waited = _waited_long(health, parameters, paused, now)
+    if waited is not None and not _may_compile(health, waited):
+        errors.append(f"the answer is stale by {waited:.0f} s")
     return errors
+
+
+def _waited_long(health: Health, parameters: NodeParameters, paused: bool, now: float) -> float | None:
+    """Seconds since which the graph has been ahead of the answer; None if that is as usual."""
+    patience = _STALE_PERIODS * max(parameters.solve_period_s, 1e-3 * _finite(health.ticks.percentile_ms(95)))
+    waited = 0.0 if health.unsolved_since is None or paused else now - health.unsolved_since
+    return waited if waited > patience else None
+
+
+def _may_compile(health: Health, waited: float) -> bool:
+    return health.answer is None and waited < _FIRST_ANSWER_S
 
 
 def _warnings(health: Health, parameters: NodeParameters, now: float) -> list[str]:

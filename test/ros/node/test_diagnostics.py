@@ -75,6 +75,15 @@ def test_what_is_wrong_is_said(health: Health, changes: dict[str, object], level
     assert status.level == level and message in status.message
 
 
+@pytest.mark.parametrize(
+    ("seconds", "level", "message"), [(30.0, WARN, "code is compiled"), (400.0, ERROR, "stale by 400 s")]
+)
+def test_the_first_answer_may_take_its_time(health: Health, seconds: float, level: bytes, message: str) -> None:
+    health.answer, health.unsolved_since = None, time.monotonic() - seconds
+    status = report(health)
+    assert status.level == level and message in status.message
+
+
 def test_warnings_about_an_answer_stay_until_one_has_none(health: Health) -> None:
     health.answer = answer(warnings=("all would agree inverted",))
     assert [report(health).level for _ in range(3)] == [WARN] * 3
