@@ -23,6 +23,7 @@ from rotavg_ros.online.measurements import (
     RejectReason,
     plain_number,
     plain_numbers,
+    whole_nanoseconds,
 )
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.quaternion import Quaternion
@@ -92,9 +93,12 @@ class OnlineEstimator:
 
         Returns:
             why it was refused and counted; None if it was taken.
+
+        Raises:
+            UserError: ``stamp_ns`` is no whole number.
         """
         turn, place = plain_numbers(world_from_body), plain_numbers(position)
-        message = OdometryMessage(robot, plain_number(stamp_ns), turn or (), place)
+        message = OdometryMessage(robot, whole_nanoseconds(stamp_ns), turn or (), place)
         with self._lock:
             return self._current.add_odometry(message)
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import math
+import operator
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
+from rotavg_ros.errors import UserError
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind
@@ -204,6 +206,18 @@ def checked_stamp(stamp_ns: int) -> int:
 def plain_number(number: Any) -> Any:
     """Convert a NumPy number to Python's own, since JSON cannot represent it."""
     return number.item() if hasattr(number, "item") else number
+
+
+def whole_nanoseconds(stamp: Any) -> int:
+    """A stamp as Python's own integer.
+
+    Raises:
+        UserError: it is no whole number: seconds, perhaps.
+    """
+    try:
+        return operator.index(stamp)
+    except TypeError:
+        raise UserError(f"stamp_ns is {stamp!r}; give whole nanoseconds, such as round(1e9 * seconds)") from None
 
 
 def plain_numbers(numbers: Sequence[float] | None) -> tuple[float, ...] | None:

@@ -319,8 +319,8 @@ def _mistaken_convention(odometry: _Odometry, closures: ViewGraph) -> str | None
         return f"{best}; {order}"
     return (
         f"{best}; {_OR_THOSE if best.hypothesis == _INVERTED else 'they'} may state the source's orientation in the "
-        "target's frame, but the target's in the source's frame is read: invert them, or swap source and target of "
-        "these edges"
+        "target's frame, but the target's in the source's frame is read: invert them; or, if their translations "
+        "say the same, swap source and target of these edges"
     )
 
 

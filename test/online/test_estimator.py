@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from rotavg_ros.errors import UserError
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
@@ -214,3 +215,12 @@ def test_numpys_numbers_mean_what_pythons_do(solver, tmp_path):
     numpys, told_too = grown(np.int64, np.float64)
     assert told_too == told and content(numpys) == content(plain)
     assert numpys.counts().pending == 2 and told[4] == "duplicate_edge"
+
+
+def test_seconds_are_no_stamps() -> None:
+    """Taken for nanoseconds, half an hour would pass for two microseconds."""
+    online = OnlineEstimator(OPTIONS)
+    for stamp in (1_700_000_000.5, np.float64(3.0)):
+        with pytest.raises(UserError, match="whole nanoseconds"):
+            online.add_odometry("r", stamp, [0.0, 0.0, 0.0, 1.0])  # type: ignore[arg-type]
+    assert online.add_odometry("r", 0, [0.0, 0.0, 0.0, 1.0]) is None

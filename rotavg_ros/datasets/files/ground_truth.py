@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,18 @@ def attach_stamps(graph_file: GraphFile, path: str | Path) -> GraphFile:
     if len(stamps) != len(graph_file.node_ids):
         what = f"{len(stamps)} stamps for {len(graph_file.node_ids)} nodes; give one per node, ascending by id"
         raise GraphFileError.at(path, None, what)
+    if len(stamps) > 2 and all(later < earlier for earlier, later in pairwise(stamps)):
+        what = "every stamp is earlier than the one before; give them in the ascending order of the nodes' ids"
+        raise GraphFileError.at(path, None, what)
     return replace(graph_file, stamps_ns=np.array(stamps, dtype=np.int64))
+
+
+def _is_number(cell: bytes) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def attach_truth(graph_file: GraphFile, path: str | Path) -> GraphFile:
@@ -67,6 +79,10 @@ def attach_truth(graph_file: GraphFile, path: str | Path) -> GraphFile:
         world_from_body = unit_quaternions(path, lines[1:], quaternions)[rows_of_nodes]
         body_from_world[matched] = _body_from_world(world_from_body)
         position_gt = graph_file.position_gt
+    elif not _is_number(cells[0][0]):
+        header = b",".join(cells[0]).decode(errors="replace")
+        what = f"the header is {header!r}; expected {_BY_ID_HEADER.decode()!r}, or none and rows stamp, x, y, heading"
+        raise GraphFileError.at(path, lines[0], what)
     else:
         stamps, numbers = _rows_by_stamp(path, lines, cells)
         if graph_file.stamps_ns is None:

@@ -104,7 +104,10 @@ def read(path: Path) -> Arrays:
     except OSError as error:
         raise StateFileError(f"cannot read the state file {path}: {error.strerror or error}") from error
     except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-        raise StateFileError(f"{path} is not a whole state file of rotavg; delete it or save a new one") from error
+        raise StateFileError(
+            f"{path} is not a whole state file of rotavg; if it is something else, name another file, and if it is "
+            "damaged, delete it"
+        ) from error
     if format_version not in _READABLE:
         raise StateFileError(
             f"{path} has state format {format_version}, this version reads {FORMAT_VERSION}; save a new one"

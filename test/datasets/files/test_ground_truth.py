@@ -36,6 +36,7 @@ def test_stamps_are_exact(tmp_path: Path, graph_file: GraphFile) -> None:
     ("text", "message"),
     [
         ("1\n2\n", "2 stamps for 3 nodes"),
+        ("3\n2\n1\n", "every stamp is earlier than the one before"),
         ("1\nx\n3\n", ":2: 'x' is not a number"),
         ("1e30\n2\n3\n", ":1: .*too large"),
         ("1\n-1e300\n3\n", ":2: stamp '-1e300' is too large; stamps are in seconds"),
@@ -64,6 +65,7 @@ def test_truth_by_stamp_within_150_ms(tmp_path: Path, graph_file: GraphFile) -> 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("id,qw,qx,qy,qz\n1,1,0,0,0\n", "the header is 'id,qw,qx,qy,qz'; expected 'id,qx,qy,qz,qw'"),
         ("", "empty"),
         ("id,qx,qy,qz,qw\n1,0,0,0\n", ":2: 4 numbers where 5 belong"),
         ("id,qx,qy,qz,qw\n1,0,0,0,0\n", ":2: a quaternion of length 0"),
@@ -71,7 +73,7 @@ def test_truth_by_stamp_within_150_ms(tmp_path: Path, graph_file: GraphFile) -> 
         ("id,qx,qy,qz,qw\n", "no row belongs to a node"),
         ("10.0, 1, 2, 0.5\n", "no stamps; give them too"),
         ("10.0, 1, 2, 0.5\n9.0, 1, 2, 0.5\n", ":2: a stamp earlier"),
-        ("timestamp,x\n", ":1: 2 numbers where 4 belong"),
+        ("timestamp,x\n", ":1: the header is 'timestamp,x'"),
     ],
 )
 def test_bad_truth(tmp_path: Path, graph_file: GraphFile, text: str, message: str) -> None:
