@@ -80,6 +80,8 @@ def run(arguments: argparse.Namespace) -> int:
             errors.append(mistake)
         else:
             print(f"{job.graph}: {_told(summary)} → {job.output}", flush=True)
+            if arguments.device == "cuda" and summary["profile"] == "slam":
+                print_warning(f"{job.graph}: --device cuda has no effect; a robot's graph is solved on the CPU")
             for warning in summary["warnings"]:
                 print_warning(f"{job.graph}: {warning}")
     for error in errors:

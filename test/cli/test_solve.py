@@ -204,6 +204,14 @@ def test_the_plan_looks_at_every_graph_once(tmp_path: Path, monkeypatch: pytest.
     assert counts[1] == 2 * counts[0]
 
 
+def test_a_gpu_is_of_no_use_to_a_robots_graph(
+    graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for device, is_told in (("cuda", True), ("cpu", False)):
+        assert main(["solve", str(graph_path), "--output", str(tmp_path / "out"), "--device", device]) == 0
+        assert ("--device cuda has no effect" in capsys.readouterr().err) == is_told
+
+
 @pytest.mark.parametrize(
     ("name", "options"), [("edges.csv", []), ("summary.json", []), ("edges.npz", ["--edges", "npz"])]
 )

@@ -43,7 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="metric (default): translations are in metres, and closures of wrong places are told by them; none: they "
         "are not, and tell positions alone",
     )
-    parser.add_argument("--device", default="auto", choices=DEVICES, help="default: auto")
+    parser.add_argument(
+        "--device",
+        default="auto",
+        choices=DEVICES,
+        help="of photo collections and scans; a robot's graph is solved on the CPU (default: auto)",
+    )
     parser.add_argument(
         "--refine",
         type=whole_number,
