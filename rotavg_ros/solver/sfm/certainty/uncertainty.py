@@ -58,8 +58,8 @@ class _Samples(NamedTuple):
 def variances(graph: ViewGraph, noise: Tensor, score: Tensor, bridge: Tensor, to: References) -> Tensor | None:
     """Variance ``(N,)`` rad² of each component of a node's error relative to its component's reference.
 
-    NaN in trees, where nothing checks anything, and in well-knit components of graphs with more than a million edges;
-    None if there are no others.
+    NaN in trees, where nothing checks anything, and in well-knit components if these have more than a million edges in
+    all, or if iterations do not converge in one of them; None if there are no other components.
 
     Args:
         noise: ``(C,)`` rad², σ² of each component.
@@ -156,7 +156,7 @@ def _in_loose(graph: ViewGraph, weight: Tensor, to: References) -> Tensor:
 def _in_well_knit(graph: ViewGraph, weight: Tensor, to: References) -> Tensor | None:
     """Relative variances ``(N,)`` in well-knit components; of nodes that have edges.
 
-    None in graphs with more than a million edges, or where the iterations do not converge.
+    None if these have more than a million edges in all, or if the iterations do not converge in one of them.
     """
     if graph.num_edges > PRIORS.most_edges:
         return None

@@ -1,8 +1,8 @@
 """Moves that reject a whole run: good closures that support each other although all other edges contradict them.
 
-For K closures of a run with residuals r, weights V⁻¹ in the solve (diagonal; 1 / V is less than the inverse variance of
-a closure that is in the tails) and covariance R of their fitted values, all other edges predict their discrepancies y
-as N(0, S):
+For K closures of a run with residuals r, weights V⁻¹ in the solve (diagonal; less than the inverse variance where a
+closure is in the tails) and covariance R of their fitted values, all other edges predict their discrepancies y as
+N(0, S):
 
     y = V (V − R)⁻¹ r,    S = V (V − R)⁻¹ V.
 """
