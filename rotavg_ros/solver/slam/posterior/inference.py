@@ -129,8 +129,8 @@ class Search:
     def _begun(self, name: str, state: State) -> Mode:
         """The mode of a start, begun with the noise of the best mode so far; the first start estimates its own.
 
-        Labels may need other noise than those of the best mode: if closures across an uneven stretch are held false,
-        nothing shows that it is uneven.
+        A start that believes more closures than the best mode may need other noise: while closures across an uneven
+        stretch are held false, nothing shows that it is uneven.
         """
         if self.modes:
             best = self.modes[0]
@@ -139,7 +139,7 @@ class Search:
                 return best
             mode = self.flipped(self.polished(state, name))
             self.keep(mode)
-            if mode.cost - noise.promised(mode) < self.modes[0].cost + self.problem.limits.rival:
+            if mode.is_false.sum() < best.is_false.sum() and mode.cost - noise.promised(mode) < self._farthest:
                 self._tune(mode)
             return mode
         mode = self.flipped(self.polished(state, name))
@@ -196,7 +196,7 @@ class Search:
 
     def flipped(self, mode: Mode) -> Mode:
         """The mode with single labels flipped as long as F falls and may come near the least F."""
-        return flipped(mode, self.modes[0].cost + self.problem.limits.rival if self.modes else np.inf)
+        return flipped(mode, self._farthest if self.modes else np.inf)
 
     def keep(self, mode: Mode) -> None:
         """Adds a mode, replacing one with the same labels and a higher F."""
@@ -205,6 +205,11 @@ class Search:
             known[mode.key] = mode
         self.modes = sorted(known.values(), key=lambda other: other.cost)
 
+    @property
+    def _farthest(self) -> float:
+        """F up to which a mode is a rival of the best."""
+        return self.modes[0].cost + self.problem.limits.rival
+
     def _next(self, done: list[Mode]) -> Mode | None:
         return next((mode for mode in self._near() if not any(mode.is_like(other.state) for other in done)), None)
 
@@ -212,7 +217,7 @@ class Search:
         """The best modes, with only the best of those that are alike."""
         best: list[Mode] = []
         for mode in self.modes:
-            if mode.cost > self.modes[0].cost + self.problem.limits.rival or len(best) == _BEAM:
+            if mode.cost > self._farthest or len(best) == _BEAM:
                 break
             if not any(mode.is_like(other.state) for other in best):
                 best.append(mode)
