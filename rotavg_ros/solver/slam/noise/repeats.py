@@ -108,20 +108,19 @@ class _Kernels(NamedTuple):
         return cls(height, float(width[-1]), float(np.cos(_FARTHEST * width[-1] / 2)))
 
 
-def places_near(when: np.ndarray, asked: np.ndarray, is_one: np.ndarray | None) -> np.ndarray:
+def places_near(when: np.ndarray, asked: np.ndarray, is_one: np.ndarray | None, window: int = _WINDOW) -> np.ndarray:
     """``(n, 4)`` ranges of closures detected shortly before and after each of some others: begin and end of both.
-
-    At most :data:`_WINDOW` before, and after.
 
     Args:
         when: ``(F,)`` when the closures were detected, ascending.
         asked: ``(n,)`` when the others were detected.
         is_one: ``(n,)`` bool, which of the others are themselves among the closures, to exclude them; None: consider
             only closures detected before.
+        window: largest number before, and after; a term of F has the default.
     """
     earlier = np.searchsorted(when, asked)
     later = np.full_like(earlier, len(when)) if is_one is None else earlier + is_one
-    ends = np.maximum(earlier - _WINDOW, 0), earlier, later, np.minimum(later + _WINDOW, len(when))
+    ends = np.maximum(earlier - window, 0), earlier, later, np.minimum(later + window, len(when))
     return np.stack(ends, axis=1)
 
 
