@@ -231,7 +231,9 @@ class ViewGraph:
         Args:
             edges: ``(M,)`` mask of the edges that connect; default all.
         """
-        return self._components if edges is None else self._joined(self.source[edges], self.target[edges])
+        if edges is not None:
+            return self.select_edges(edges)._components
+        return self._components
 
     @cached_property
     def rotation_components(self) -> int:
@@ -242,14 +244,11 @@ class ViewGraph:
 
     @cached_property
     def _components(self) -> Tensor:
-        return self._joined(self.source, self.target)
-
-    def _joined(self, *ends: Tensor) -> Tensor:
         # Takes a tenth of a second to load, and may never be needed.
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import connected_components
 
-        source, target = (end.cpu().int().numpy() for end in ends)
+        source, target = (end.cpu().int().numpy() for end in (self.source, self.target))
         # Transposing a matrix with one entry in every row, here an edge's target in the column of its source, sorts by
         # counting; scipy's own conversion takes longer than the search.
         edge = np.arange(len(source) + 1, dtype=np.int32)

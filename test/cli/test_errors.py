@@ -169,7 +169,7 @@ def test_folder_in_the_way_of_an_output(capsys: pytest.CaptureFixture[str], tmp_
 def test_graph_is_never_overwritten(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = tmp_path / "edges.npz"
     write_graph(path, GraphFile.from_ids(np.array([0]), np.array([1]), np.array([[0.0, 0, 0, 1]])))
-    assert "would be overwritten" in refused(capsys, "solve", path, "--output", tmp_path)
+    assert "would be overwritten" in refused(capsys, "solve", path, "--output", tmp_path, "--edges", "npz")
     assert read_graph(path).graph.num_edges == 1
 
 

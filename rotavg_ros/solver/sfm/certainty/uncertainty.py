@@ -99,13 +99,13 @@ def noise_variance(graph: ViewGraph, angle: Tensor, score: Tensor, component: Te
         angle: ``(M,)`` rad, residuals.
         score: ``(M,)`` probability that an edge is an outlier, given its residual.
     """
-    count, is_believed = int(component.max()) + 1, score < PRIORS.flagged
-    of_edge, square = component[graph.source[is_believed]], angle[is_believed].to(score).square()
-    part = graph.components(is_believed).to(component)
-    of_part = torch.empty_like(part[: int(part.max()) + 1]).index_copy_(0, part, component)
-    # Number of believed edges beyond a spanning forest of them, at least one.
-    edges, nodes, parts = (torch.bincount(each, minlength=count) for each in (of_edge, component, of_part))
-    checks = edges - nodes + parts
+    count, believed = int(component.max()) + 1, (score < PRIORS.flagged).nonzero()[:, 0]
+    ends = [end.index_select(0, believed) for end in (graph.source, graph.target)]
+    of_edge, square = component.index_select(0, ends[0]), angle.index_select(0, believed).to(score).square()
+    is_joined = torch.zeros_like(component).index_fill_(0, torch.cat(ends), 1)
+    # Number of believed edges beyond a tree of the nodes that they join, at least one.
+    joined = torch.zeros_like(component[:1]).repeat(count).index_add_(0, component, is_joined)
+    checks = torch.bincount(of_edge, minlength=count) - joined + 1
     return square.new_zeros(count).index_add_(0, of_edge, square) / (3 * checks.clamp(min=1))
 
 

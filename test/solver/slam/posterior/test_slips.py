@@ -67,7 +67,7 @@ def test_slips_and_false_closures_are_told_apart(planar: bool, false_share: floa
     assert (flagged[is_slip]).all()
     assert not flagged[~is_false & ~is_slip].any()
     assert any("slipped 2 times" in warning and "neurora~slips" in warning for warning in solution.warnings)
-    without = solve(graph, profile="slam", method="neurora~slips")
+    without = solve(graph, profile="slam", method="neurora~slips,tails")
     assert not any("slipped" in warning for warning in without.warnings)
     errors = orientation_errors(without.body_from_world, as_quaternions(truth), graph.components())
     assert np.degrees(float(errors.mean())) > 5
