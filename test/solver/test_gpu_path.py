@@ -37,9 +37,9 @@ def _forget(traffic: Traffic) -> None:
 @pytest.mark.parametrize(
     ("method", "waits"),
     [
-        pytest.param("neurora", 320, marks=pytest.mark.large),
+        pytest.param("neurora", 335, marks=pytest.mark.large),
         ("neurora-v2", 73),
-        pytest.param("neurora-round", 321, marks=pytest.mark.large),
+        pytest.param("neurora-round", 336, marks=pytest.mark.large),
     ],
 )
 def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> None:
@@ -63,9 +63,9 @@ def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> Non
         # So is how surely they are attached: from the answer, residuals and scores, with shares of one component.
         from_gpu += [(nodes, 4), (nodes,)] + [(edges,)] * 4 + [(1,)] * 2
         to_gpu += [(edges,), (nodes,)]
-        # Samples of the uncertainty are drawn there, given edges' ends and weights, and nodes' components.
-        from_gpu += [(edges,)] * 3 + [(nodes,)]
-        to_gpu += [(nodes, 64)]
+        # Samples of the uncertainty are drawn there, given edges' ends, weights and components: few, then all.
+        from_gpu += [(edges,)] * 6 + [(nodes,)] * 2
+        to_gpu += [(nodes, 8), (nodes, 64)]
         from_gpu += [(nodes,)]
     assert sorted(traffic.to_gpu) == sorted(to_gpu)
     assert sorted(traffic.from_gpu) == sorted(from_gpu)
