@@ -184,7 +184,9 @@ def _older_files(folder: Path) -> set[str]:
     except (OSError, ValueError, KeyError, TypeError):
         return set()
     possible = set().union(*(_possible_files(suffix, poses=True) for suffix in EDGE_FORMATS))
-    return possible.intersection(names) if isinstance(names, list) and _SUMMARY in names else set()
+    if not (isinstance(names, list) and _SUMMARY in names):
+        return set()
+    return {name for name in possible if name in names}
 
 
 def summarize(

@@ -229,6 +229,27 @@ def test_what_no_answer_has_written_is_not_overwritten(
         assert main(["solve", str(graph_path), "--output", str(out), *options]) == 0
 
 
+@pytest.mark.parametrize("listed", ["[]", "null", '{"files": "summary.json"}', '{"files": [{"name": "edges.csv"}]}'])
+def test_a_summary_of_another_program_lists_nothing(
+    graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], listed: str
+) -> None:
+    (tmp_path / "summary.json").write_text(listed)
+    assert main(["solve", str(graph_path), "--output", str(tmp_path)]) == 2
+    assert "summary.json would be overwritten" in capsys.readouterr().err
+
+
+def test_others_files_beside_an_answer_stay(graph_path: Path, tmp_path: Path) -> None:
+    """Edges of an older answer in another format go, somebody's own do not."""
+    out = tmp_path / "out"
+    assert main(["solve", str(graph_path), "--output", str(out), "--edges", "npz"]) == 0
+    assert main(["solve", str(graph_path), "--output", str(out), "--edges", "none"]) == 0
+    assert not (out / "edges.npz").exists()
+    (out / "edges.npz").write_text("somebody's own")
+    (out / "summary.json").write_text('{"files": [{}, "summary.json", "orientations.csv"]}')
+    assert main(["solve", str(graph_path), "--output", str(out)]) == 0
+    assert (out / "edges.npz").read_text() == "somebody's own"
+
+
 def test_installed_command(graph_path: Path, tmp_path: Path) -> None:
     """As a process, from another folder; nothing but the summary on stdout, nothing on stderr."""
     command = [sys.executable, "-m", "rotavg_ros.cli.main", "solve", str(graph_path), "--output", "out"]
