@@ -178,21 +178,33 @@ def solve_upper(shape: Shape, first: int, last: int, store: np.ndarray, columns:
         for c in range(num_columns):
             for i in range(len(row)):
                 value[num_pivots + i] = columns[row[i], c]
-            for k in range(num_pivots - 1, -1, -1):
-                line = own[k]
-                # Four partial sums.
+            last = num_pivots
+            while last >= 4:
+                # Four rows at once: what is known is read once for all of them.
+                one, two, three, four = own[last - 1], own[last - 2], own[last - 3], own[last - 4]
                 a, b, left, right = 0.0, 0.0, 0.0, 0.0
-                i = k + 1
-                while i + 4 <= width:
-                    a += line[i] * value[i]
-                    b += line[i + 1] * value[i + 1]
-                    left += line[i + 2] * value[i + 2]
-                    right += line[i + 3] * value[i + 3]
-                    i += 4
-                while i < width:
-                    a += line[i] * value[i]
-                    i += 1
-                value[k] = (columns[start + k, c] - ((a + b) + (left + right))) / line[k]
+                for i in range(last, width):
+                    known = value[i]
+                    a += one[i] * known
+                    b += two[i] * known
+                    left += three[i] * known
+                    right += four[i] * known
+                end = start + last
+                last_of_four = (columns[end - 1, c] - a) / one[last - 1]
+                b += two[last - 1] * last_of_four
+                second = (columns[end - 2, c] - b) / two[last - 2]
+                left += three[last - 1] * last_of_four + three[last - 2] * second
+                third = (columns[end - 3, c] - left) / three[last - 3]
+                right += four[last - 1] * last_of_four + four[last - 2] * second + four[last - 3] * third
+                value[last - 1], value[last - 2], value[last - 3] = last_of_four, second, third
+                value[last - 4] = (columns[end - 4, c] - right) / four[last - 4]
+                last -= 4
+            for k in range(last - 1, -1, -1):
+                line, total = own[k], 0.0
+                for i in range(k + 1, width):
+                    total += line[i] * value[i]
+                value[k] = (columns[start + k, c] - total) / line[k]
+            for k in range(num_pivots):
                 columns[start + k, c] = value[k]
 
 

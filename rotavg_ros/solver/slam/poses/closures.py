@@ -249,6 +249,10 @@ class Places:
         """Whether the same closures join the right places, of all or ``among`` some of them."""
         return bool((np.abs(self.right - other.right)[among] < _OTHERWISE).all())
 
+    def is_within(self, other: Places) -> bool:
+        """Whether no closure joins the right places that does not in the others, too."""
+        return bool((self.right - other.right < _OTHERWISE).all())
+
     @property
     def rotation_good(self) -> np.ndarray:
         """``(C,)`` probability that a closure's rotation is not false."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.products import product
+from rotavg_ros.solver.slam.update.given import Given
 from rotavg_ros.solver.slam.update.linear import Linear
 
 
@@ -52,6 +53,8 @@ class Columns:
         anchors: ``(b,)`` blocks that the anchors of new nodes belong to, ascending.
         units: ``((K + R) d, b d)`` :attr:`Linear.left` of the unit columns of these blocks.
         at_anchors: ``(n d, b d)`` covariance of closures and these blocks.
+        given: of the first closures, those that are good by what was known before any of them.
+        surer: ``(N', d)`` rad² or m², by how much these lower the variances of the first new nodes.
     """
 
     edge: np.ndarray
@@ -61,12 +64,14 @@ class Columns:
     anchors: np.ndarray
     units: np.ndarray
     at_anchors: np.ndarray
+    given: Given
+    surer: np.ndarray
 
     @classmethod
     def none(cls) -> Columns:
         """The columns of no closures."""
-        nothing = np.empty(0, dtype=np.int64)
-        return cls(nothing, (), (), np.empty((0, 0)), nothing, np.empty((0, 0)), np.empty((0, 0)))
+        nothing, none = np.empty(0, dtype=np.int64), np.empty((0, 0))
+        return cls(nothing, (), (), none, nothing, none, none, Given.none(0, 0), none)
 
     def and_of(self, linear: Linear, edge: np.ndarray, right: np.ndarray) -> Columns:
         """The columns of these closures and of more.

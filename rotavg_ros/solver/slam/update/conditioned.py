@@ -28,7 +28,7 @@ from rotavg_ros.solver.slam.poses.rows import crossing
 from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.update.columns import Columns
-from rotavg_ros.solver.slam.update.given import Given
+from rotavg_ros.solver.slam.update.given import Change, Given
 from rotavg_ros.solver.slam.update.linear import Linear
 from rotavg_ros.solver.slam.update.moved import Hangs, shifted, turned
 from rotavg_ros.view_graph import ViewGraph
@@ -100,20 +100,25 @@ def conditioned(
         columns = columns.and_of(linear, edge[some], system.columns(some))
     columns = columns.with_anchors(linear, system.anchors)
     count = len(columns.edge)
-    covariance = system.covariance(columns.covariance, count)
-    given = Given.of(covariance, np.zeros(count, dtype=bool))
-    for _ in range(_ROUNDS):
-        mean, left_out = given.left_out(covariance, system.residual[:count])
-        odds, rotation_odds = system.log_odds(mean, left_out, slice(count))
-        accepted = odds > 0
-        if (accepted == given.is_given).all():
+    covariance, residual = system.covariance(columns.covariance, count), system.residual[:count]
+    rows = system.of_new_nodes(columns)
+    odds, rotation_odds = system.log_odds(*Given.none(count, linear.size).left_out(covariance, residual), slice(count))
+    given, changes = columns.given.changed_to(covariance, odds > 0)
+    surer = _surer(columns.surer, rows, given, changes)
+    columns = replace(columns, given=given, surer=surer)
+    for _ in range(_ROUNDS - 1):
+        odds, rotation_odds = system.log_odds(*given.left_out(covariance, residual), slice(count))
+        if ((odds > 0) == given.is_given).all():
             break
-        given = Given.of(covariance, accepted)
+        given, changes = given.changed_to(covariance, odds > 0)
+        surer = _surer(surer, rows, given, changes)
     apart = system.log_odds(system.residual[count:], system.independent(slice(count, None)), slice(count, None))
     score = expit(-np.append(odds, apart[0]))
     rotation_score = expit(-np.append(rotation_odds, apart[1]))
     precision = np.stack((1 / system.own[0], system.is_known / system.own[1]), axis=1)
-    return Conditioned(system.moved(columns, given), score, np.minimum(score, rotation_score), precision, columns)
+    return Conditioned(
+        system.moved(columns, given, surer), score, np.minimum(score, rotation_score), precision, columns
+    )
 
 
 @dataclass(frozen=True)
@@ -307,16 +312,14 @@ class _System:
         both = told + _log_normal(mean, covariance, 1) - false_turn - false_place
         return np.where(self.is_known[which], both, rotation), rotation
 
-    def moved(self, columns: Columns, by: Given) -> LaidOn:
-        """The answer after the given closures have moved all nodes."""
-        accepted, precision = by.is_given, by.precision
-        if not accepted.any():
+    def moved(self, columns: Columns, by: Given, surer: np.ndarray) -> LaidOn:
+        """The answer after the given closures have moved all nodes, and lowered variances of new ones ``(n, d)``."""
+        if not by.is_given.any():
             return self.laid
-        linear, d, k, count = self.linear, self.linear.size, self._widths[0], len(accepted)
+        linear, d, k, count = self.linear, self.linear.size, self._widths[0], len(by.is_given)
         q = self.residual.shape[2]
-        laid = replace(self.laid, variance=self._surer(columns, precision, accepted))
-        pull = np.zeros((count, d, q))
-        pull[accepted] = product(precision, self.residual[:count][accepted].reshape(-1, q)).reshape(-1, d, q)
+        laid = replace(self.laid, variance=self._lowered(surer))
+        pull = product(by.precision, self.residual[:count].reshape(-1, q)).reshape(count, d, q)
         step = columns.moves(linear, pull.reshape(-1, q))
         new = np.arange(linear.num_nodes, len(self.anchor))
         walked = self._walked(new[None], np.ones(1), count)
@@ -335,21 +338,14 @@ class _System:
         position = shifted(hangs, turn, (shift, walked_shift), self.way, self.laid.position)
         return replace(laid, body_from_world=orientation, position=position)
 
-    def _surer(self, columns: Columns, precision: np.ndarray, accepted: np.ndarray) -> np.ndarray:
-        """``(2, N')`` rad² and m², variances of nodes, reduced by the closures for new nodes only.
-
-        Args:
-            columns: columns of n closures.
-            precision: ``(a d, a d)`` S⁻¹ of the accepted ones.
-            accepted: ``(n,)`` bool.
-        """
-        linear, d, (k, m), count = self.linear, self.linear.size, self._widths, len(accepted)
+    def of_new_nodes(self, columns: Columns) -> np.ndarray:
+        """``(N' - N, d, n d)`` rad² and m², covariance of new nodes with the residuals of n closures."""
+        linear, d, (k, m), count = self.linear, self.linear.size, self._widths, len(columns.edge)
         new = np.arange(linear.num_nodes, len(self.anchor))
-        if len(new) == 0:
-            return self.laid.variance
-        anchor = self.anchor[new]
+        if len(new) == 0 or count == 0:
+            return np.zeros((len(new), d, count * d))
         above, below = columns.at(self.anchors)
-        share = linear.share[:, anchor][:, :, None, None]
+        share = linear.share[:, self.anchor[new]][:, :, None, None]
         walked = self._walked(new[None], np.ones(1), count)
         told = [(1 - share[kind]) * above + share[kind] * below for kind in (0, 1)]
         both = np.concatenate((told[0][:, :k], told[1][:, k:]), axis=1).reshape(len(new), d, count, d)
@@ -358,14 +354,36 @@ class _System:
             both[:, k:] += np.einsum("nmk,nkcd->nmcd", lever, both[:, :k])
         for axis, kind in enumerate(np.repeat([0, 1], (k, m))):
             both[:, axis, :, axis] += walked[kind]
-        pulled = both[:, :, accepted].reshape(len(new), d, len(precision))
-        fallen = (product(pulled, precision) * pulled).sum(axis=2)
+        return both.reshape(len(new), d, -1)
+
+    def _lowered(self, surer: np.ndarray) -> np.ndarray:
+        """``(2, N')`` rad² and m², variances of nodes, those of new ones lowered by ``(N' - N, d)``."""
         variance: np.ndarray = self.laid.variance.copy()
-        for kind, part in enumerate((fallen[:, :k], fallen[:, k:])):
+        new, k = slice(self.linear.num_nodes, None), self._widths[0]
+        for kind, part in enumerate((surer[:, :k], surer[:, k:])):
             if part.shape[1]:
                 before = variance[kind, new]
                 variance[kind, new] = np.maximum(before - part.mean(axis=1), _SUREST * before)
         return variance
+
+
+def _surer(before: np.ndarray, rows: np.ndarray, given: Given, changes: list[Change] | None) -> np.ndarray:
+    """``(n, d)`` rad² or m², by how much given closures lower the variances of new nodes.
+
+    Args:
+        before: ``(n', d)`` the same for the first n' ≤ n nodes, before the changes.
+        rows: ``(n, d, c d)`` covariances of the nodes with all closures.
+        given: the given ones.
+        changes: how these have changed; None: in another way.
+    """
+    count, d, width = rows.shape
+    known = 0 if changes is None else len(before)
+    surer = np.empty((count, d))
+    surer[known:] = given.told(rows[known:].reshape(-1, width)).reshape(-1, d)
+    surer[:known] = before[:known].reshape(-1, d)
+    for change in changes or ():
+        surer[:known] += change.told(rows[:known].reshape(-1, width)).reshape(-1, d)
+    return surer
 
 
 def _log_normal(mean: np.ndarray, covariance: np.ndarray, times: int) -> np.ndarray:

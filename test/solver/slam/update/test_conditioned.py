@@ -172,3 +172,27 @@ def test_closures_between_keyframes_that_are_known(translations: bool, number: i
     assert turned_deg(quick, after).mean() < 0.1
     flags = [(one.outlier_score > 0.5).numpy()[-len(late) :] for one in (quick, after)]
     np.testing.assert_array_equal(*flags)
+
+
+@pytest.mark.parametrize("translations", [False, True])
+def test_tick_by_tick_it_is_the_same_as_at_once(translations: bool) -> None:
+    """What a tick takes over from the one before, inverses and variances, is what it would work out from nothing."""
+    graph, _ = drawn(translations=translations, planar=True)
+    before = solve(first(graph, KNOWN), profile="slam")
+    memory = before.memory
+    assert isinstance(memory, SlamMemory)
+    memory = replace(memory, update_work=1e9)  # which no tick waits for
+
+    def tick(count: int, memory: SlamMemory) -> Solution:
+        known = first(graph, count)
+        return solve(known, profile="slam", warm_start=grown(known, before), memory=memory, work=1e4)
+
+    at_once = tick(KNOWN + NEW, memory)
+    for count in range(KNOWN + 2, KNOWN + NEW + 1, 2):
+        ticked = tick(count, memory)
+        assert isinstance(ticked.memory, SlamMemory) and ticked.memory.update is not None
+        memory = ticked.memory
+    assert memory.columns is not None and len(memory.columns.edge) > 10
+    assert turned_deg(ticked, at_once).max() < 1e-9
+    np.testing.assert_allclose(ticked.outlier_score, at_once.outlier_score, atol=1e-9)
+    np.testing.assert_allclose(ticked.uncertainty, at_once.uncertainty, rtol=1e-9)

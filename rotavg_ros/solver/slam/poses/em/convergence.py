@@ -34,16 +34,25 @@ class Ending:
     Attributes:
         held_for: number of solves after which it ends, with most variances held, or earlier once places have converged.
         until: it also ends where the same closures join right places as in these.
+        is_for_more: with ``until``, it also ends where none does besides those: what its start believed of others has
+            been rejected again.
     """
 
     held_for: int | None = None
     until: Places | None = None
+    is_for_more: bool = False
 
     def is_early(self, number: int, places: Places, *, is_at_rest: bool) -> bool:
         """Whether to end after ``number`` solves although variances have not converged."""
         if self.held_for is not None and (is_at_rest or number == self.held_for):
             return True
-        return self.until is not None and number >= _ALIKE_AFTER and places.is_like(self.until)
+        return number >= _ALIKE_AFTER and self.is_reached(places)
+
+    def is_reached(self, places: Places) -> bool:
+        """Whether places are no other than in ``until``, or with ``is_for_more`` nothing besides."""
+        if self.until is None:
+            return False
+        return places.is_like(self.until) or (self.is_for_more and places.is_within(self.until))
 
 
 TO_REST = Ending()

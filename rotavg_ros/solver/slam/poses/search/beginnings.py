@@ -36,7 +36,8 @@ def begun_at_runs(rival: Rival) -> Rival:
             if members.tobytes() in tried:
                 continue
             tried.add(members.tobytes())
-            begun = moved(rival, PoseStart.anew(rival.pose, members))
+            # Once all of the run is rejected again, what is left is the beginning with no run, which comes last.
+            begun = moved(rival, PoseStart.anew(rival.pose, members), is_for_more=len(members) > 0)
             if begun.cost < rival.cost - LEAST_GAIN:
                 rival = without_runs(with_runs(begun))
                 break

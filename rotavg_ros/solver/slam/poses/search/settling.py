@@ -84,12 +84,17 @@ def settled(problem: PoseProblem, start: PoseStart) -> Rival:
     return settling(estimate_poses(problem, start=start))
 
 
-def moved(rival: Rival, start: PoseStart) -> Rival:
-    """The rival that another start of the same labelling leads to; ``rival`` itself if places end as they were."""
-    ending = Ending(until=rival.pose.solved.places)
+def moved(rival: Rival, start: PoseStart, *, is_for_more: bool = False) -> Rival:
+    """The rival that another start of the same labelling leads to; ``rival`` itself if places end as they were.
+
+    Args:
+        rival: the labelling with its poses.
+        start: where to begin.
+        is_for_more: ``rival`` itself also where no closure is believed that it rejects.
+    """
+    ending = Ending(until=rival.pose.solved.places, is_for_more=is_for_more)
     pose = estimate_poses(rival.pose.problem, start=start, ending=ending)
-    is_same = pose.solved.places.is_like(rival.pose.solved.places)
-    return rival if is_same else settling(pose, rival.cost)
+    return rival if ending.is_reached(pose.solved.places) else settling(pose, rival.cost)
 
 
 def _held(problem: PoseProblem, pose: PoseMode) -> Rival:
