@@ -9,6 +9,7 @@ from torch import Tensor
 from rotavg_ros.online.answer.closure_queue import ClosureQueue
 from rotavg_ros.online.answer.screening import Known
 from rotavg_ros.online.compaction.renumbering import Renumbering
+from rotavg_ros.online.compaction.thinning import Verdict
 
 
 class LastAnswer:
@@ -18,6 +19,7 @@ class LastAnswer:
         body_from_world: ``(n, 4)``; None before the first answer.
         component: ``(n,)``; None where it is not known.
         outlier: ``(m,)`` flags.
+        waited: ``(m',)`` closures that it did not solve; their flags come from their residuals alone.
         known: what else it knows of these nodes; None before the first answer.
         queue: closures of the graph that wait to be solved.
     """
@@ -40,7 +42,17 @@ class LastAnswer:
         self.outlier: NDArray[np.bool_] = np.zeros(0, dtype=bool) if outlier is None else outlier
         self.known = None if body_from_world is None else Known.of_orientations(body_from_world)
         self.queue = ClosureQueue() if queued is None else ClosureQueue(queued)
+        self.waited = self.queue.waits
         self._since_problem: Renumbering | None = None
+
+    @property
+    def verdict(self) -> NDArray[np.int8]:
+        """``(m,)`` :class:`Verdict` on each edge: what a compaction goes by."""
+        verdict = np.where(self.outlier, Verdict.FALSE, Verdict.BELIEVED).astype(np.int8)
+        # After a slip of odometry it is the good closures that contradict the answer and wait.
+        waited = np.flatnonzero(self.waited[: len(verdict)])
+        verdict[waited] = np.minimum(verdict[waited], Verdict.UNSOLVED)
+        return verdict
 
     def begin_problem(self) -> None:
         """The next answer will be in the graph's present numbering."""
@@ -51,12 +63,15 @@ class LastAnswer:
         self.body_from_world, self.component, self.outlier, self.known = body_from_world, component, outlier, known
         if self._since_problem is not None:
             self._apply(self._since_problem)
+        # The queue has been as the problem left it since then, and has followed compactions.
+        self.waited = self.queue.waits
 
     def renumber(self, renumbering: Renumbering) -> None:
         """Follow a compaction of the graph."""
         earlier = self._since_problem
         self._since_problem = renumbering if earlier is None else earlier.then(renumbering)
         self.queue.renumber(renumbering)
+        self.waited = renumbering.flags(self.waited)
         self._apply(renumbering)
 
     def _apply(self, renumbering: Renumbering) -> None:

@@ -7,8 +7,9 @@ drives, the rest covers the whole path, and a closure to any place finds a keyfr
 1. Keyframes that no closure touches: taking them out changes nothing
    (:mod:`~rotavg_ros.online.compaction.marginalization`).
 2. Only if these do not suffice, closures: first those judged false, then those that are the best (the newest that is
-   not false) on neither of the two stretches of the path that they join, and those that span no more than a stretch.
-   Stretches double until enough is free. So every stretch that has closures keeps one.
+   not flagged) on neither of the two stretches of the path that they join, and those that span no more than a stretch.
+   Stretches double until enough is free. So every stretch that has closures keeps one. A closure that still waits to
+   be solved is not judged false, whatever its residual; it is better than one that is.
 
 Closures without which the graph would fall apart stay, and so do those a user has accepted.
 """
@@ -17,12 +18,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rotavg_ros.online.compaction.marginalization import Columns, are_between, is_plain_odometry
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
+
+
+class Verdict(IntEnum):
+    """What the last answer says of an edge; the lower, the sooner it stays."""
+
+    BELIEVED = 0  # or too new to be judged
+    UNSOLVED = 1  # flagged for its residual alone, and waiting to be solved
+    FALSE = 2
 
 
 def load() -> None:
@@ -85,7 +95,7 @@ class Thinning:
 def thin(
     num_nodes: int,
     edges: Columns,
-    is_false: NDArray[np.bool_],
+    verdict: NDArray[np.int8],
     protected: NDArray[np.bool_],
     surplus_nodes: int,
     surplus_edges: int,
@@ -95,7 +105,7 @@ def thin(
     Args:
         num_nodes: N.
         edges: of the graph, see :data:`~rotavg_ros.online.compaction.marginalization.Columns`.
-        is_false: ``(M,)`` edges that were judged outliers.
+        verdict: ``(M,)`` :class:`Verdict` on each edge.
         protected: ``(N,)`` nodes that must stay; the first of every chain does in any case.
         surplus_nodes, surplus_edges: how many to remove.
     """
@@ -117,7 +127,7 @@ def thin(
         return nodes < surplus_nodes or min(nodes, surplus_nodes) + int(dropped.sum()) < surplus_edges
 
     if lacking():
-        for spared in _sparable_closures(way, edges, is_false, stays):
+        for spared in _sparable_closures(way, edges, verdict, stays):
             spared = spared[~dropped[spared]]
             dropped[spared] = True
             if not lacking():
@@ -155,24 +165,24 @@ def _evenly(way: Way, free: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
 
 
 def _sparable_closures(
-    way: Way, edges: Columns, is_false: NDArray[np.bool_], stays: NDArray[np.bool_]
+    way: Way, edges: Columns, verdict: NDArray[np.int8], stays: NDArray[np.bool_]
 ) -> Iterator[NDArray[np.int64]]:
     """Closures in the order of removal: ascending arrays of edge indices, which may repeat earlier ones."""
     source, target = edges["source"], edges["target"]
-    false = is_false | (edges["label"] == EdgeLabel.REJECTED)
+    verdict = np.where(edges["label"] == EdgeLabel.REJECTED, Verdict.FALSE, verdict).astype(np.int8)
     may_go = (edges["kind"] == EdgeKind.LOOP_CLOSURE) & (edges["label"] != EdgeLabel.ACCEPTED)
     may_go &= ~(stays[source] & stays[target])
-    may_go[_bridges(way, edges, false)] = False
-    yield np.flatnonzero(may_go & false)
+    may_go[_bridges(way, edges, verdict)] = False
+    yield np.flatnonzero(may_go & (verdict == Verdict.FALSE))
 
     closure = np.flatnonzero(edges["kind"] == EdgeKind.LOOP_CLOSURE)
     ends = np.stack((source[closure], target[closure]), axis=1)
     ends.sort(axis=1)
     chain, position = way.chain[ends], way.position[ends]
     span = np.where(chain[:, 0] == chain[:, 1], np.abs(position[:, 0] - position[:, 1]), np.inf)
-    # The best first: those that have to stay, then those that are not false, then the newest.
+    # The best first: those that have to stay, then by their verdict, then the newest.
     rank = np.empty(len(closure), dtype=np.int64)
-    rank[np.lexsort((-closure, false[closure], may_go[closure]))] = np.arange(len(closure))
+    rank[np.lexsort((-closure, verdict[closure], may_go[closure]))] = np.arange(len(closure))
     width = 1.0
     while width < 4 * way.length + 4:
         along = np.floor_divide(position, width).astype(np.int64)
@@ -184,8 +194,8 @@ def _sparable_closures(
         width *= 2
 
 
-def _bridges(way: Way, edges: Columns, false: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Edges of a spanning forest over the odometry chains; edges that are not false are preferred."""
+def _bridges(way: Way, edges: Columns, verdict: NDArray[np.int8]) -> NDArray[np.int64]:
+    """Edges of a spanning forest over the odometry chains; those of the better verdict are preferred."""
     from scipy.sparse import coo_array, csr_array
     from scipy.sparse.csgraph import minimum_spanning_tree
 
@@ -193,13 +203,13 @@ def _bridges(way: Way, edges: Columns, false: NDArray[np.bool_]) -> NDArray[np.i
     ends.sort(axis=1)
     between = np.flatnonzero(ends[:, 0] != ends[:, 1])
     low, high = ends[between].T
-    order = np.lexsort((false[between], high, low))
+    order = np.lexsort((verdict[between], high, low))
     low, high, between = low[order], high[order], between[order]
     new = np.ones(len(low), dtype=bool)
     new[1:] = (np.diff(low) != 0) | (np.diff(high) != 0)
     low, high, between = low[new], high[new], between[new]
     shape = (len(way.first), len(way.first))
-    tree = minimum_spanning_tree(csr_array(coo_array((1.0 + false[between], (low, high)), shape=shape))).tocoo()
+    tree = minimum_spanning_tree(csr_array(coo_array((1.0 + verdict[between], (low, high)), shape=shape))).tocoo()
     # The keys ascend row by row, as `low` and `high` do.
     place = np.searchsorted(low * len(way.first) + high, tree.row.astype(np.int64) * len(way.first) + tree.col)
     return np.asarray(between[place])

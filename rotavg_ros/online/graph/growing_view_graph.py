@@ -12,7 +12,7 @@ from rotavg_ros.odometry_route import ROUTE_COLUMNS
 from rotavg_ros.online.compaction.marginalization import Columns, marginalize
 from rotavg_ros.online.compaction.marginalized_keyframes import Forgotten, MarginalizedIndex, MarginalizedKeyframes
 from rotavg_ros.online.compaction.renumbering import Renumbering
-from rotavg_ros.online.compaction.thinning import thin
+from rotavg_ros.online.compaction.thinning import Verdict, thin
 from rotavg_ros.online.graph.keyframe_index import KeyframeIndex
 from rotavg_ros.online.graph.snapshot import GraphEdge, GraphSnapshot
 from rotavg_ros.online.growing_array import GrowingArray
@@ -199,7 +199,7 @@ class GrowingViewGraph:
         self,
         surplus_keyframes: int,
         surplus_edges: int,
-        is_false: NDArray[np.bool_],
+        verdict: NDArray[np.int8],
         max_marginalized: int,
         needed: Sequence[int],
     ) -> Renumbering | None:
@@ -207,17 +207,17 @@ class GrowingViewGraph:
 
         Args:
             surplus_keyframes, surplus_edges: how many to remove.
-            is_false: which of the first M' ≤ M edges are judged to be outliers.
+            verdict: :class:`Verdict` on the first M' ≤ M edges.
             max_marginalized: number of marginalised keyframes whose poses are remembered.
             needed: nodes that stay, besides the robots' latest.
         """
         keyframes: Columns = {name: column.view for name, column in self._keyframe.items()}
         edges: Columns = {name: column.view for name, column in self._edge.items()}
-        false = np.zeros(self.num_edges, dtype=bool)
-        false[: len(is_false)] = is_false
+        verdicts = np.full(self.num_edges, Verdict.BELIEVED, dtype=np.int8)
+        verdicts[: len(verdict)] = verdict
         protected = self._latest()
         protected[list(needed)] = True
-        thinning = thin(self.num_keyframes, edges, false, protected, surplus_keyframes, surplus_edges)
+        thinning = thin(self.num_keyframes, edges, verdicts, protected, surplus_keyframes, surplus_edges)
         if not thinning.nodes.any() and not thinning.edges.any():
             return None
         stays = np.flatnonzero(~thinning.edges)

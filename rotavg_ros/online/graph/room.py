@@ -26,8 +26,8 @@ class GraphsAnswer(Protocol):
     """What has been answered about the graph so far, in the graph's numbering."""
 
     @property
-    def outlier(self) -> NDArray[np.bool_]:
-        """Flags ``(m,)`` of the first m edges."""
+    def verdict(self) -> NDArray[np.int8]:
+        """:class:`~rotavg_ros.online.compaction.thinning.Verdict` on the first m edges ``(m,)``."""
 
     def renumber(self, renumbering: Renumbering) -> None:
         """Follow a compaction of the graph."""
@@ -73,7 +73,7 @@ class Room:
         if not any(surplus):
             return False
         remembered = max(_REMEMBERED * max_keyframes, _REMEMBERED_AT_LEAST)
-        renumbering = graph.compact(surplus[0], surplus[1], answer.outlier, remembered, needed)
+        renumbering = graph.compact(surplus[0], surplus[1], answer.verdict, remembered, needed)
         gained = sizes[0] - graph.num_keyframes, sizes[1] - graph.num_edges
         for index, limit in enumerate(limits):
             if surplus[index] and gained[index] < max(1, _WORTHWHILE * limit):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -249,6 +250,43 @@ def test_they_wait_on(flooded: Run, tmp_path: Path, change: str) -> None:
     assert {*answer.edge_id[answer.waits].tolist()} <= {*waiting, flooded.closures}
     assert closures(flooded.solver.graphs[-1]) == int((answer.kind == EdgeKind.LOOP_CLOSURE).sum() - answer.waits.sum())
     assert answer.waits.any() and (online.counts().dropped_closures > 0) == (change == "compact")
+
+
+@pytest.mark.parametrize("under_way", [False, True])
+def test_a_full_graph_does_not_take_those_that_wait_for_false(under_way: bool) -> None:
+    """After a slip of odometry the good closures contradict the answer, and wait. Every keyframe keeps one of them.
+
+    So it is while the solve is under way that they have entered, and has not answered yet.
+    """
+    run = Run()
+    run.drive(KEYFRAMES)
+    run.close(200)
+    run.drive(100)
+    run.tick()
+    for number in range(400):
+        source, target = KEYFRAMES + number // 5, int(run.rng.integers(KEYFRAMES))
+        run.online.add_edge(edge(FLOOD + number, source, target, STEP_DEG * (target - source) + 90, 1))
+    answer = run.tick()
+    assert answer.waits.sum() > 250 and answer.outlier[answer.waits].all()
+    waiting = {*answer.edge_id[answer.waits].tolist()}
+
+    def ends_of_waiting() -> set[int]:
+        left = run.online.snapshot()
+        ends = np.maximum(left.graph.source.numpy(), left.graph.target.numpy())
+        return {*left.keyframe_id[ends[np.isin(left.edge_id, [*waiting])]].tolist()}
+
+    def compact() -> None:
+        run.online.set_options(replace(OPTIONS, max_edges=750))
+        run.drive(1)
+        assert run.online.counts().dropped_closures > 200
+
+    before = ends_of_waiting()
+    if under_way:
+        run.solver.on_call = compact
+        run.online.tick(force_cold=True)
+    else:
+        compact()
+    assert ends_of_waiting() == before
 
 
 def test_of_a_flood_of_random_closures_none_is_believed(monkeypatch: pytest.MonkeyPatch) -> None:
