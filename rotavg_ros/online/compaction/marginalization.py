@@ -5,13 +5,17 @@ composed, ``R_xu = R_xv R_vu``, variances are added. That is what :mod:`rotavg_r
 for every solve anyway, so the solution at all other keyframes stays the same. What else is needed of the steps, how far
 each turned and where it led, the edge keeps as sums (:mod:`rotavg_ros.odometry_route`). Long runs of such keyframes are
 removed in a few vectorised rounds, each of which takes an independent set out of those left (Luby 1986).
+
+Where several odometries tie v to u and to x, each of them is composed by itself. If their variances have one ratio on
+either side, that is exact as well, whatever the ratio is: with the sums w, z of their precisions on either side,
+1 / (1/w + 1/z) is the sum of the same of each. The solver estimates the ratio.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,30 +23,9 @@ from numpy.typing import NDArray
 
 from rotavg_ros import rotations
 from rotavg_ros.odometry_route import ROUTE_COLUMNS, Routes, joined
+from rotavg_ros.online.compaction.chain import Columns, OdometryPairs
 from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedKeyframes
 from rotavg_ros.online.measurements import OWN_EDGE_ID
-from rotavg_ros.view_graph import EdgeKind, EdgeLabel
-
-Columns = dict[str, NDArray[Any]]
-"""Of the graph's edges, by name: those of :class:`~rotavg_ros.view_graph.ViewGraph`, edge_id and translation."""
-
-
-def is_plain_odometry(edges: Columns) -> NDArray[np.bool_]:
-    """Odometry edges that nobody has labelled, ``(M,)``; these can be merged."""
-    return np.asarray((edges["kind"] == EdgeKind.ODOMETRY) & (edges["label"] == EdgeLabel.AUTOMATIC))
-
-
-def are_between(num_nodes: int, edges: Columns) -> NDArray[np.bool_]:
-    """Nodes between exactly two plain odometry edges to different nodes, whatever other edges they have, ``(N,)``."""
-    plain = is_plain_odometry(edges)
-    source, target = edges["source"], edges["target"]
-    both = np.concatenate((source[plain], target[plain]))
-    opposite = np.concatenate((target[plain], source[plain])).astype(np.float64)
-    degree = np.bincount(both, minlength=num_nodes)
-    total = np.bincount(both, opposite, num_nodes)
-    # Exact in float64: two equal neighbours n have 2 n² for the sum of squares of n + n.
-    squares = np.bincount(both, opposite**2, num_nodes)
-    return np.asarray((degree == 2) & (2 * squares != total**2))
 
 
 @dataclass(frozen=True)
@@ -73,9 +56,10 @@ def marginalize(
     remove: NDArray[np.bool_],
     marginalized: MarginalizedKeyframes,
 ) -> Contraction:
-    """Take out the nodes of a mask ``(N,)``; each must be between steps (:func:`are_between`) and have no other edge.
+    """Take out the nodes of a mask ``(N,)``.
 
-    Where a cycle of odometry would shrink to a pair of nodes, one node in it stays.
+    Each must have two neighbours, tied to both by equally many edges of plain odometry, and no other edge. Where a
+    cycle of odometry would shrink to a pair of nodes, one node in it stays.
 
     Args:
         keyframes: columns robot, keyframe_id, stamp_ns, time_line.
@@ -85,14 +69,34 @@ def marginalize(
         marginalized: the keyframes marginalised before; their edges are renumbered, their poses kept.
     """
     work = _Work.begin(keyframes, edges, routes, remove, marginalized)
-    while work.round():
-        pass
+    for layer in _layers(edges, remove, marginalized):
+        work.begin_layer(layer)
+        while work.round():
+            pass
     return work.result()
+
+
+def _layers(
+    edges: Columns, remove: NDArray[np.bool_], marginalized: MarginalizedKeyframes
+) -> Iterator[NDArray[np.int64]]:
+    """Edges at the nodes to remove, rank by rank: at each node two or none of a rank."""
+    carries = np.zeros(len(edges["source"]), dtype=bool)
+    carries[marginalized.edge] = True
+    touched = np.flatnonzero(remove[edges["source"]] | remove[edges["target"]])
+    some = {name: edges[name][touched] for name in ("source", "target", "kind", "label", "steps")}
+    rank = OdometryPairs.of(some, carries[touched]).rank
+    order = np.argsort(rank, kind="stable")
+    bounds = np.searchsorted(rank[order], np.arange(rank.max(initial=-1) + 2))
+    for first, last in itertools.pairwise(bounds.tolist()):
+        yield touched[order[first:last]]
 
 
 @dataclass
 class _Work:
-    """A contraction in progress; edges keep their rows until the end, two merged ones continue in the later row."""
+    """A contraction in progress; edges keep their rows until the end, two merged ones continue in the later row.
+
+    Edges of one rank are merged with each other only. The keyframes are placed on those of the first rank.
+    """
 
     edges: Columns
     routes: NDArray[np.float64]
@@ -102,6 +106,7 @@ class _Work:
     incident: NDArray[np.int64]
     merged_into: NDArray[np.int64]
     waiting: NDArray[np.int64]
+    num_layers: int = 0  # begun so far
     rank: NDArray[np.int64] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -129,22 +134,25 @@ class _Work:
         )
         row_of_node = np.full(len(remove), -1)
         row_of_node[nodes] = len(marginalized) + np.arange(len(nodes))
-        num_edges = len(edges["source"])
-        both = np.concatenate((edges["source"], edges["target"]))
-        half_edges = np.flatnonzero(remove[both])
-        half_edges = half_edges[np.argsort(both[half_edges], kind="stable")]
-        incident = np.full((len(remove), 2), -1)
-        incident[nodes] = half_edges.reshape(-1, 2) % max(num_edges, 1)
         return cls(
             {name: values.copy() for name, values in edges.items()},
             routes,
             marginalized.followed_by(new).arrays(),
             row_of_node,
             remove.copy(),
-            incident,
-            np.arange(num_edges),
-            nodes,
+            np.full((len(remove), 2), -1),
+            np.arange(len(edges["source"])),
+            nodes[:0],
         )
+
+    def begin_layer(self, layer: NDArray[np.int64]) -> None:
+        """Go on with the edges of one rank."""
+        self.num_layers += 1
+        both = np.concatenate((self.edges["source"][layer], self.edges["target"][layer]))
+        half_edges = np.flatnonzero(self.remove[both])
+        half_edges = half_edges[np.argsort(both[half_edges], kind="stable")]
+        self.waiting = both[half_edges[::2]]
+        self.incident[self.waiting] = np.tile(layer, 2)[half_edges].reshape(-1, 2)
 
     def round(self) -> bool:
         """Take out an independent set of the waiting nodes; returns False once none were left."""
@@ -205,7 +213,8 @@ class _Work:
             )
         for columns in moved:
             self._write_riders(*columns)
-        self._write_riders(self.row_of_node[nodes], survivor, v_from_u, v_in_u, steps_before)
+        if self.num_layers == 1:
+            self._write_riders(self.row_of_node[nodes], survivor, v_from_u, v_in_u, steps_before)
 
         parts = (before, v_from_u, v_in_u), (after, x_from_v, x_in_v)
         in_order = (ends[:, 0] < nodes) & (nodes < ends[:, 1])

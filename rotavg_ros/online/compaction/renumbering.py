@@ -18,7 +18,7 @@ class Renumbering:
         kept: ``(N',)`` the nodes that are left, ascending.
         edge_of: ``(M,)`` the edge that each edge has become a part of, -1 for dropped ones.
         last: ``(M',)`` the last edge that each edge consists of, ascending.
-        num_dropped: edges that were dropped.
+        num_dropped: closures that were dropped.
     """
 
     kept: NDArray[np.int64]

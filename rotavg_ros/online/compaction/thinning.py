@@ -6,24 +6,27 @@ drives, the rest covers the whole path, and a closure to any place finds a keyfr
 
 1. Keyframes that no closure touches: taking them out changes nothing
    (:mod:`~rotavg_ros.online.compaction.marginalization`).
-2. Only if these do not suffice, closures: first those judged false, then those that are the best (the newest that is
-   not flagged) on neither of the two stretches of the path that they join, and those that span no more than a stretch.
-   Stretches double until enough is free. So every stretch that has closures keeps one. A closure that still waits to
-   be solved is not judged false, whatever its residual; it is better than one that is.
+2. Only if these do not suffice, keyframes that odometry links to more than those next to them
+   (:mod:`~rotavg_ros.online.compaction.chain`). Their links go with them, and the chain stays.
+3. Only if these do not suffice, closures, and none but those of a keyframe that this frees: first those judged false,
+   then those that are the best (the newest that is not flagged) on neither of the two stretches of the path that they
+   join, and those that span no more than a stretch. Stretches double until enough is free. So every stretch that has
+   closures keeps one. A closure that still waits to be solved is not judged false, whatever its residual; it is better
+   than one that is.
 
 Closures without which the graph would fall apart stay, and so do those a user has accepted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rotavg_ros.online.compaction.marginalization import Columns, are_between, is_plain_odometry
+from rotavg_ros.online.compaction.chain import Chain, Columns, are_between, is_plain_odometry
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
 
@@ -93,53 +96,72 @@ class Thinning:
 
 
 def thin(
-    num_nodes: int,
     edges: Columns,
     verdict: NDArray[np.int8],
     protected: NDArray[np.bool_],
+    carries: NDArray[np.bool_],
     surplus_nodes: int,
     surplus_edges: int,
 ) -> Thinning:
     """Choose what to remove; less than asked for where nothing else can be spared.
 
     Args:
-        num_nodes: N.
-        edges: of the graph, see :data:`~rotavg_ros.online.compaction.marginalization.Columns`.
+        edges: of the graph, see :data:`~rotavg_ros.online.compaction.chain.Columns`.
         verdict: ``(M,)`` :class:`Verdict` on each edge.
         protected: ``(N,)`` nodes that must stay; the first of every chain does in any case.
+        carries: ``(M,)`` edges that marginalised keyframes lie on; these stay.
         surplus_nodes, surplus_edges: how many to remove.
     """
-    way = Way.along(num_nodes, edges)
+    way = Way.along(len(protected), edges)
     stays = protected.copy()
     stays[way.first] = True
-    dropped = np.zeros(len(edges["source"]), dtype=bool)
+    source, target = edges["source"], edges["target"]
+    dropped, others = np.zeros(len(source), dtype=bool), np.flatnonzero(~is_plain_odometry(edges))
 
-    # Plain odometry is never dropped, so the nodes between two of its edges are the same whatever else is dropped.
-    between, others = are_between(num_nodes, edges) & ~stays, np.flatnonzero(~is_plain_odometry(edges))
-
-    def free() -> NDArray[np.bool_]:
-        free, left = between.copy(), others[~dropped[others]]
-        free[edges["source"][left]] = free[edges["target"][left]] = False
+    def untouched(between: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which of the nodes have no edges left but of plain odometry."""
+        free, left = between & ~stays, others[~dropped[others]]
+        free[source[left]] = free[target[left]] = False
         return np.asarray(free)
 
-    def lacking() -> bool:
-        nodes = int(free().sum())
-        return nodes < surplus_nodes or min(nodes, surplus_nodes) + int(dropped.sum()) < surplus_edges
+    free = untouched(are_between(len(protected), edges, carries))
+    if free.sum() >= surplus_nodes:
+        nodes = _evenly(way, free, surplus_nodes)
+    else:
+        chain = Chain.of(len(protected), edges, carries)
+        wanted = min(surplus_nodes, int((chain.between & ~stays).sum()))
+        closures = _sparable_closures(way, edges, verdict, stays)
+        _drop(dropped, closures, lambda: int(untouched(chain.between).sum()) < wanted)
+        nodes = _evenly(way, untouched(chain.between), surplus_nodes)
+        # A closure goes for a keyframe that goes, and for no other.
+        dropped &= nodes[source] | nodes[target]
+        dropped |= chain.gone_with(nodes)
+    closures = _sparable_closures(way, edges, verdict, stays)
+    _drop(dropped, closures, lambda: int(nodes.sum() + dropped.sum()) < surplus_edges)
+    return Thinning(nodes, dropped)
 
-    if lacking():
-        for spared in _sparable_closures(way, edges, verdict, stays):
-            spared = spared[~dropped[spared]]
-            dropped[spared] = True
-            if not lacking():
-                # Drop no more than needed, the oldest first.
-                enough, count = len(spared), 0
-                while enough - count > 1:
-                    middle = (enough + count) // 2
-                    dropped[spared] = np.arange(len(spared)) < middle
-                    enough, count = (enough, middle) if lacking() else (middle, count)
-                dropped[spared] = np.arange(len(spared)) < enough
-                break
-    return Thinning(_evenly(way, free(), surplus_nodes), dropped)
+
+def _drop(dropped: NDArray[np.bool_], sparable: Iterable[NDArray[np.int64]], lacking: Callable[[], bool]) -> None:
+    """Drop edges in their order, no more than needed; of those that are equally good the first.
+
+    Args:
+        dropped: ``(M,)``; changed in place.
+        sparable: arrays of edges, which may repeat earlier ones.
+        lacking: whether more have to be dropped.
+    """
+    if not lacking():
+        return
+    for some in sparable:
+        spared = some[~dropped[some]]
+        dropped[spared] = True
+        if not lacking():
+            enough, count = len(spared), 0
+            while enough - count > 1:
+                middle = (enough + count) // 2
+                dropped[spared] = np.arange(len(spared)) < middle
+                enough, count = (enough, middle) if lacking() else (middle, count)
+            dropped[spared] = np.arange(len(spared)) < enough
+            return
 
 
 def _evenly(way: Way, free: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:

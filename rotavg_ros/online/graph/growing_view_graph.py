@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from rotavg_ros.odometry_route import ROUTE_COLUMNS
-from rotavg_ros.online.compaction.marginalization import Columns, marginalize
+from rotavg_ros.online.compaction.chain import Columns
+from rotavg_ros.online.compaction.marginalization import marginalize
 from rotavg_ros.online.compaction.marginalized_keyframes import Forgotten, MarginalizedIndex, MarginalizedKeyframes
 from rotavg_ros.online.compaction.renumbering import Renumbering
 from rotavg_ros.online.compaction.thinning import Verdict, thin
@@ -217,12 +218,15 @@ class GrowingViewGraph:
         verdicts[: len(verdict)] = verdict
         protected = self._latest()
         protected[list(needed)] = True
-        thinning = thin(self.num_keyframes, edges, verdicts, protected, surplus_keyframes, surplus_edges)
+        riders = self.marginalized.keyframes
+        carries = np.zeros(self.num_edges, dtype=bool)
+        carries[riders.edge] = True
+        thinning = thin(edges, verdicts, protected, carries, surplus_keyframes, surplus_edges)
         if not thinning.nodes.any() and not thinning.edges.any():
             return None
+        num_closures = int((thinning.edges & (edges["kind"] == EdgeKind.LOOP_CLOSURE)).sum())
         stays = np.flatnonzero(~thinning.edges)
         place = np.cumsum(~thinning.edges) - 1
-        riders = self.marginalized.keyframes
         riders = MarginalizedKeyframes(**(riders.arrays() | {"edge": place[riders.edge]}))
         left = {name: values[stays] for name, values in edges.items()}
         contraction = marginalize(keyframes, left, self._routes, thinning.nodes, riders)
@@ -237,7 +241,7 @@ class GrowingViewGraph:
         self.revision += 1
         edge_of = np.full(len(place), -1)
         edge_of[stays] = contraction.edge_of
-        return Renumbering(contraction.kept, edge_of, stays[contraction.last], int(thinning.edges.sum()))
+        return Renumbering(contraction.kept, edge_of, stays[contraction.last], num_closures)
 
     def snapshot(self) -> GraphSnapshot:
         """The present graph. Only labels and moments are copied, since nothing else can change later."""

@@ -16,7 +16,8 @@ from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.evaluation.common.cases import drawings
 from rotavg_ros.evaluation.slam import stress
 from rotavg_ros.odometry_route import ROUTE_COLUMNS
-from rotavg_ros.online.compaction.marginalization import Columns, are_between, is_plain_odometry, marginalize
+from rotavg_ros.online.compaction.chain import Columns, are_between, is_plain_odometry
+from rotavg_ros.online.compaction.marginalization import marginalize
 from rotavg_ros.online.compaction.marginalized_keyframes import Forgotten, MarginalizedIndex, MarginalizedKeyframes
 from rotavg_ros.solver import solve
 from rotavg_ros.view_graph import ViewGraph
@@ -62,10 +63,11 @@ def laplacian(num_nodes: int, edges: Columns) -> np.ndarray:
 
 @st.composite
 def drives(draw) -> tuple[Rotation, np.ndarray, Columns]:
-    """True poses, and edges without noise: a chain with edges either way, a few more of either kind, and labels."""
+    """True poses, and edges without noise: chains with edges either way, a few more of either kind, and labels."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    count, more = draw(st.integers(3, 25)), draw(st.integers(0, 6))
-    ends = np.array([(i, i + 1) for i in range(count - 1)] + [rng.choice(count, 2, replace=False) for _ in range(more)])
+    count, more, chains = draw(st.integers(3, 25)), draw(st.integers(0, 6)), draw(st.integers(1, 3))
+    chain = [(i, i + 1) for i in range(count - 1)] * chains
+    ends = np.array(chain + [rng.choice(count, 2, replace=False) for _ in range(more)])
     turned = rng.random(len(ends)) < 0.3
     ends[turned] = ends[turned, ::-1]
     source, target = ends[rng.permutation(len(ends))].T

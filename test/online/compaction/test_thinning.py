@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import rotations
@@ -17,6 +19,8 @@ from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
 from rotavg_ros.online.graph import room
 from rotavg_ros.online.graph.fingerprints import Fingerprints
+from rotavg_ros.online.graph.growing_view_graph import GrowingViewGraph
+from rotavg_ros.online.graph.snapshot import GraphEdge, GraphSnapshot
 from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
@@ -106,7 +110,7 @@ def test_indices_follow_even_while_a_solve_is_under_way(judging, solver, tmp_pat
 
     def meanwhile() -> None:
         drive.go(7)
-        drive.close_some(4)
+        drive.close_some(8)
 
     solver.on_call = meanwhile
     first = None
@@ -288,3 +292,123 @@ def test_odometry_goes_on_from_a_keyframe_that_edges_named_long_before_it_came(s
     assert estimator.counts().marginalized > 40
     graph = estimator.snapshot()
     assert len(graph.keyframe_id) <= 40 and {59} <= set(graph.keyframe_id[graph.keyframe_robot == 0].tolist())
+
+
+def edge(edge_id: int, source: int, target: int, turn: float, kind: EdgeKind) -> EdgeMeasurement:
+    """Of a front end's keyframes, a second apart; ``turn``: radians from the source to the target about z."""
+    ends = (KeyframeReference("r", end, (end + 1) * SECOND) for end in (source, target))
+    return EdgeMeasurement(edge_id, *ends, (0.0, 0.0, np.sin(-turn / 2), np.cos(turn / 2)), kind)
+
+
+TWO_ODOMETRIES, TWO_BEFORE, EIGHT_BEFORE = [(1, 1.0), (1, 1.01)], [(1, 1.0), (2, 1.0)], [(i, 1.0) for i in range(1, 9)]
+
+
+@pytest.mark.parametrize("links", [TWO_ODOMETRIES, TWO_BEFORE])
+def test_odometry_that_a_front_end_states_more_than_once_costs_no_closure(solver, links) -> None:
+    """A full graph goes on with new keyframes; an odometry that scales turns by 1.01 stays one by itself."""
+    estimator = OnlineEstimator(EstimatorOptions(keyframe_source="edges", max_keyframes=100), solver)
+    step, closures = 0.1, 0
+    for target in range(1, 300):
+        for span, scale in links:
+            estimator.add_edge(edge(target, max(0, target - span), target, span * scale * step, EdgeKind.ODOMETRY))
+        if target > 60 and target % 10 == 0:
+            closures += 1
+            closure = edge(1000 + target, target - 60, target, 60 * step, EdgeKind.LOOP_CLOSURE)
+            assert estimator.add_edge(closure) is None
+    left, counts = estimator.snapshot(), estimator.counts()
+    assert len(left.keyframe_id) + counts.marginalized == 300 and not counts.is_full
+    is_closure = ~left.graph.is_odometry.numpy()
+    assert counts.dropped_closures == 0 and is_closure.sum() == closures
+    way = left.keyframe_id[left.graph.target] - left.keyframe_id[left.graph.source].astype(float)
+    turned = rotations.log(left.graph.target_from_source)[:, 2].numpy() / step + way
+    off = np.abs(turned - 2 * np.pi / step * np.round(turned / (2 * np.pi / step)))
+    if links is TWO_ODOMETRIES:
+        pairs = np.unique(np.stack((left.graph.source, left.graph.target))[:, ~is_closure], axis=1, return_counts=True)
+        assert (pairs[1] == 2).all()
+        scaled = np.flatnonzero(off > 1e-6)
+        assert 2 * len(scaled) == (~is_closure).sum()
+        np.testing.assert_allclose(off[scaled], 0.01 * way[scaled], atol=1e-6)
+    else:
+        assert off.max() < 1e-6
+
+
+def test_a_closure_goes_for_a_keyframe_that_goes_and_for_no_other(solver) -> None:
+    """Odometry that a user has accepted holds its keyframes, whatever closures are dropped."""
+    rng = np.random.default_rng(0)
+    for accepted in (200, 100):
+        estimator = OnlineEstimator(EstimatorOptions(keyframe_source="edges", max_keyframes=150), solver)
+        ends: dict[int, tuple[int, int]] = {}
+        for target in range(1, 200):
+            estimator.add_edge(edge(target, target - 1, target, 0.1, EdgeKind.ODOMETRY))
+            if target < accepted:
+                estimator.label_edge("r", target, EdgeLabel.ACCEPTED)
+            if 20 < target < 140:
+                for number in (1000 + target, 2000 + target):
+                    source = int(rng.integers(target - 10))
+                    assert estimator.add_edge(edge(number, source, target, 0.1 * (target - source), 1)) is None
+                    ends[number] = source, target
+        left, counts = estimator.snapshot(), estimator.counts()
+        kept, keyframes = {*left.edge_id.tolist()}, {*left.keyframe_id.tolist()}
+        gone = {number for number in ends if number not in kept}
+        assert counts.dropped_closures == len(gone) and (counts.marginalized == 0) == (accepted == 200)
+        assert all({*ends[number]} - keyframes for number in gone)
+        assert counts.is_full or accepted != 200
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32), st.integers(1, 3))
+def test_whatever_odometry_there_is_what_stays_is_true_and_as_connected_as_it_was(seed: int, robots: int) -> None:
+    """Odometry without noise between any keyframes, some of it labelled, thinned three times and added to meanwhile."""
+    rng = np.random.default_rng(seed)
+    growing, pose = GrowingViewGraph(), Rotation.random(80, rng=rng)
+    robot_of, place = [f"{rng.integers(robots)}" for _ in range(80)], rng.normal(size=(80, 3))
+
+    def add(kind: EdgeKind, source: int, target: int) -> None:
+        ends = (growing.node(robot_of[end], end) for end in (source, target))
+        if source != target and None not in (ends := tuple(ends)):
+            turn = (pose[target].inv() * pose[source]).as_quat()
+            shift = pose[source].inv().apply(place[target] - place[source])
+            label = EdgeLabel.ACCEPTED if rng.random() < 0.05 else EdgeLabel.AUTOMATIC
+            growing.add_edge(GraphEdge(*ends, tuple(turn), kind, label, translation=tuple(shift)))
+
+    for later in (40, 60, 80):
+        for keyframe in range(later - 40 if later == 40 else later - 20, later):
+            growing.add_keyframe(robot_of[keyframe], keyframe)
+            for _ in range(rng.integers(1, 4)):
+                add(EdgeKind.ODOMETRY, keyframe, max(0, keyframe - int(rng.integers(1, 4))))
+            if rng.random() < 0.3:
+                add(EdgeKind.LOOP_CLOSURE, keyframe, int(rng.integers(later)))
+        before = growing.snapshot()
+        verdict = rng.integers(0, 3, growing.num_edges).astype(np.int8)
+        growing.compact(int(rng.integers(20)), int(rng.integers(2) * rng.integers(30)), verdict, 1000, [])
+        check_true(growing.snapshot(), pose, place)
+        check_as_connected(before, growing.snapshot())
+
+
+def check_true(left: GraphSnapshot, pose: Rotation, place: np.ndarray) -> None:
+    """Edges and the poses of marginalised keyframes are those of the true poses."""
+    ids, graph, riders = left.keyframe_id.astype(int), left.graph, left.marginalized.keyframes
+    source, target = ids[graph.source.numpy()], ids[graph.target.numpy()]
+    turned = Rotation.from_quat(graph.target_from_source.numpy()) * (pose[target].inv() * pose[source]).inv()
+    assert turned.magnitude().max() < 1e-7
+    shift = pose[source].inv().apply(place[target] - place[source])
+    np.testing.assert_allclose(left.translation, shift, atol=1e-7)
+    gone = riders.keyframe_id.astype(int)
+    assert not {*gone.tolist()} & {*ids.tolist()} and len(gone) + len(ids) == max([*ids.tolist(), *gone.tolist()]) + 1
+    if len(gone):
+        on = source[riders.edge]
+        turned = Rotation.from_quat(riders.keyframe_from_source) * (pose[gone].inv() * pose[on]).inv()
+        assert turned.magnitude().max() < 1e-7
+        np.testing.assert_allclose(riders.position, pose[on].inv().apply(place[gone] - place[on]), atol=1e-7)
+
+
+def check_as_connected(before: GraphSnapshot, after: GraphSnapshot) -> None:
+    """Keyframes that are left are in one component of odometry, or of all edges, if they were."""
+    row = np.searchsorted(before.keyframe_id, after.keyframe_id)
+    for chosen in ("odometry", "all"):
+        component = [
+            (each.graph.select_edges(each.graph.is_odometry) if chosen == "odometry" else each.graph).components()
+            for each in (before, after)
+        ]
+        pairs = {*zip(component[0][row].tolist(), component[1].tolist(), strict=True)}
+        assert len(pairs) == len({old for old, _ in pairs}) == len({new for _, new in pairs})
