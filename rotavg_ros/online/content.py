@@ -37,6 +37,7 @@ class Counts:
         odometry_restarts: how often a robot's odometry began anew, or had to be treated as new.
         marginalized, dropped_closures: numbers of keyframes and closures removed from a full graph so far.
         is_full: whether nothing more can be spared, so that no new keyframes are added.
+        is_full_of_edges: likewise, so that no new edges are added.
         robots: names of the robots that have keyframes.
         odometry_robots: names of the robots whose odometry has come.
         pending_by_robot: number of edges that wait for each robot.
@@ -54,6 +55,7 @@ class Counts:
     marginalized: int = 0
     dropped_closures: int = 0
     is_full: bool = False
+    is_full_of_edges: bool = False
     robots: tuple[str, ...] = ()
     odometry_robots: tuple[str, ...] = ()
     pending_by_robot: Mapping[str, int] = field(default_factory=dict)
@@ -273,6 +275,7 @@ class Content:
             marginalized=growth.room.marginalized,
             dropped_closures=growth.room.dropped_closures,
             is_full=growth.room.is_full(growth.graph, growth.options.max_keyframes),
+            is_full_of_edges=growth.room.is_full_of_edges(growth.graph, growth.options.most_edges),
             robots=tuple(growth.graph.robots),
             odometry_robots=tuple(growth.tracks),
             pending_by_robot=dict(growth.pending.by_robot),

@@ -35,8 +35,9 @@ class EstimatorOptions:
 
     Keyframes that are chosen from odometry are numbered 0, 1, 2 … per robot. Where a front end sends them, one without
     an id gets its stamp as id (the next free number where a keyframe of an earlier time line has that), and odometry
-    only carries the newest one on to the present. Edges of odometry come on top of ``max_edges``. How a graph stays
-    within its bounds: :mod:`~rotavg_ros.online.compaction.thinning`.
+    only carries the newest one on to the present. Edges between keyframes that are chosen from odometry come on top of
+    ``max_edges``; a front end's odometry counts. How a graph stays within its bounds:
+    :mod:`~rotavg_ros.online.compaction.thinning`.
 
     Raises:
         OptionError: a value that an option cannot have.
@@ -117,7 +118,7 @@ class EstimatorOptions:
     max_edges: int = option(
         2_000_000,
         f"at this many edges, or {EDGES_PER_KEYFRAME} times max_keyframes, the loop closures that can best be spared "
-        "are dropped",
+        "are dropped, and odometry's links past the next keyframe",
         within=(1, 1_000_000_000),
         live=True,
     )

@@ -35,7 +35,7 @@ WHY_REFUSED = {
     RejectReason.CONTRADICTORY_ODOMETRY: "a front end says another step between the same keyframes; it began anew?",
     RejectReason.PENDING_OVERFLOW: "too many edges were waiting for their keyframes (pending_capacity)",
     RejectReason.PENDING_TIMEOUT: "an edge waited too long for its keyframe (pending_timeout_s)",
-    RejectReason.GRAPH_FULL: "the graph has as many edges as it may have (max_edges), and none to spare",
+    RejectReason.GRAPH_FULL: "the graph has as many edges as it may have (max_edges, max_keyframes), and none to spare",
     RejectReason.MARGINALIZED_KEYFRAME: "the keyframe was taken out of a full graph too long ago (max_keyframes)",
     RejectReason.WRONG_LENGTH: "a rotation that is not four numbers, or a position that is not three",
 }

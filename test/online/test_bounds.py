@@ -6,9 +6,11 @@ import gc
 import sys
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
 SECOND = 1_000_000_000
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
@@ -86,3 +88,23 @@ def test_closures_are_bounded_with_the_keyframes() -> None:
     assert counts.keyframes <= 100 and counts.dropped_closures > 1000
     closures = counts.edges - (counts.keyframes - 1)
     assert taken == closures + counts.dropped_closures
+
+
+@pytest.mark.parametrize("label", [EdgeLabel.ACCEPTED, EdgeLabel.AUTOMATIC])
+def test_it_is_told_when_a_graph_is_full_of_edges_that_cannot_be_spared(label: EdgeLabel) -> None:
+    """It is not full of keyframes then; and a second odometry that is stated again and again can be spared."""
+    options = EstimatorOptions(keyframe_source="edges", max_keyframes=20)
+    online = OnlineEstimator(options, lambda *_, **__: None)
+    kind = EdgeKind.LOOP_CLOSURE if label == EdgeLabel.ACCEPTED else EdgeKind.ODOMETRY
+    refused = 0
+    for number in range(200):
+        target = 1 + number % 10
+        turned = (0.0, 0.0, np.sin(1e-3 * number), np.cos(1e-3 * number))
+        ends = KeyframeReference("r", target - 1), KeyframeReference("r", target)
+        of_kind = EdgeKind.ODOMETRY if number < 10 else kind
+        refused += online.add_edge(EdgeMeasurement(number, *ends, turned, of_kind)) == "graph_full"
+        online.label_edge("r", number, label)
+        counts = online.counts()
+        assert counts.edges <= options.most_edges == 120 and counts.is_full_of_edges == (refused > 0)
+    assert refused == (80 if label == EdgeLabel.ACCEPTED else 0) and not counts.is_full
+    assert counts.keyframes == 11 and counts.dropped_closures == 0

@@ -126,6 +126,14 @@ class Chain:
         between[pairs.ends[np.where(on_chain, carrying > 1, carrying > 0)]] = False
         return cls(pairs, on_chain, between, carries)
 
+    def beside(self) -> NDArray[np.int64]:
+        """Edges beside the chain that can be dropped: those between the farthest keyframes first, then the oldest."""
+        pairs = self.pairs
+        edge = np.flatnonzero((pairs.rank >= 0) & ~self.carries)
+        edge = edge[(pairs.rank[edge] > 0) | ~self.on_chain[pairs.of_edge[edge]]]
+        low, high = pairs.ends[pairs.of_edge[edge]].T
+        return np.asarray(edge[np.argsort(low - high, kind="stable")])
+
     def gone_with(self, nodes: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """What of plain odometry is to be dropped so that nodes between ``(N,)`` can be taken out; ``(M,)``.
 

@@ -14,11 +14,15 @@ drives, the rest covers the whole path, and a closure to any place finds a keyfr
    closures keeps one. A closure that still waits to be solved is not judged false, whatever its residual; it is better
    than one that is.
 
+Where there are too many edges for the keyframes, odometry beside the chain goes while it outnumbers the closures, the
+longest links first; then closures in the order above; then what is left beside the chain.
+
 Closures without which the graph would fall apart stay, and so do those a user has accepted.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
@@ -136,8 +140,13 @@ def thin(
         # A closure goes for a keyframe that goes, and for no other.
         dropped &= nodes[source] | nodes[target]
         dropped |= chain.gone_with(nodes)
-    closures = _sparable_closures(way, edges, verdict, stays)
-    _drop(dropped, closures, lambda: int(nodes.sum() + dropped.sum()) < surplus_edges)
+    if nodes.sum() + dropped.sum() < surplus_edges:
+        beside = Chain.of(len(protected), edges, carries).beside()
+        beside = beside[~(dropped | nodes[source] | nodes[target])[beside]]
+        num_closures = int((~dropped & (edges["kind"] == EdgeKind.LOOP_CLOSURE)).sum())
+        more = beside[: max(0, len(beside) - num_closures)]
+        sparable = itertools.chain([more], _sparable_closures(way, edges, verdict, stays), [beside])
+        _drop(dropped, sparable, lambda: int(nodes.sum() + dropped.sum()) < surplus_edges)
     return Thinning(nodes, dropped)
 
 

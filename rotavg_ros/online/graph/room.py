@@ -50,6 +50,10 @@ class Room:
         """Whether no keyframe can be added, even after everything that can be spared has been taken out."""
         return graph.num_keyframes >= max_keyframes and graph.revision < self.compact_from_revision[0]
 
+    def is_full_of_edges(self, graph: GrowingViewGraph, max_edges: int) -> bool:
+        """Whether no edge of others can be added, likewise."""
+        return graph.num_edges >= max_edges and graph.revision < self.compact_from_revision[1]
+
     def try_again(self) -> None:
         """Attempt again from now on, since the limits have changed."""
         self.compact_from_revision = [0, 0]

@@ -77,6 +77,8 @@ class Reporter:
             warnings.append(f"more closures came at once than a tick takes in: {counts.queued} wait to be solved")
         if counts.is_full:
             warnings.append("the graph is full and nothing can be spared: no new keyframes (max_keyframes)")
+        if counts.is_full_of_edges:
+            warnings.append("the graph is full and no edge can be spared: no new edges (max_edges, max_keyframes)")
         if health.lost > self._lost:
             warnings.append(f"{health.lost - self._lost} messages lost")
         if counts.odometry_restarts > self._restarts:

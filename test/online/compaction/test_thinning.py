@@ -303,14 +303,21 @@ def edge(edge_id: int, source: int, target: int, turn: float, kind: EdgeKind) ->
 TWO_ODOMETRIES, TWO_BEFORE, EIGHT_BEFORE = [(1, 1.0), (1, 1.01)], [(1, 1.0), (2, 1.0)], [(i, 1.0) for i in range(1, 9)]
 
 
-@pytest.mark.parametrize("links", [TWO_ODOMETRIES, TWO_BEFORE])
+@pytest.mark.parametrize("links", [TWO_ODOMETRIES, TWO_BEFORE, EIGHT_BEFORE])
 def test_odometry_that_a_front_end_states_more_than_once_costs_no_closure(solver, links) -> None:
-    """A full graph goes on with new keyframes; an odometry that scales turns by 1.01 stays one by itself."""
-    estimator = OnlineEstimator(EstimatorOptions(keyframe_source="edges", max_keyframes=100), solver)
+    """A full graph goes on with new keyframes; an odometry that scales turns by 1.01 stays one by itself.
+
+    With eight links for each keyframe the graph is full of edges first.
+    """
+    options = EstimatorOptions(keyframe_source="edges", max_keyframes=100)
+    estimator = OnlineEstimator(options, solver)
     step, closures = 0.1, 0
     for target in range(1, 300):
         for span, scale in links:
-            estimator.add_edge(edge(target, max(0, target - span), target, span * scale * step, EdgeKind.ODOMETRY))
+            if target >= span:
+                link = edge(target, target - span, target, span * scale * step, EdgeKind.ODOMETRY)
+                assert estimator.add_edge(link) is None
+            assert estimator.counts().edges <= options.most_edges
         if target > 60 and target % 10 == 0:
             closures += 1
             closure = edge(1000 + target, target - 60, target, 60 * step, EdgeKind.LOOP_CLOSURE)

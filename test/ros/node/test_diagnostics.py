@@ -112,6 +112,13 @@ def test_odometry_that_is_refused_is_not_called_silent(health: Health) -> None:
     assert report(health).message == "no odometry for 100 s on /odom"
 
 
+@pytest.mark.parametrize(("of", "told"), [("is_full", "no new keyframes"), ("is_full_of_edges", "no new edges")])
+def test_a_full_graph_is_told_with_what_it_is_full_of(health: Health, of: str, told: str) -> None:
+    counts = Counts(10, 12, 0, {}, **{of: True})
+    status = Reporter("rotavg: estimator").report(health, counts, NodeParameters(), False)
+    assert status.level == WARN and status.message.startswith("the graph is full") and told in status.message
+
+
 def test_edges_that_wait_for_what_hardly_comes(health: Health) -> None:
     def of(**counts: object) -> str:
         reporter = Reporter("rotavg: estimator")
