@@ -109,10 +109,12 @@ class CurrentContent:
             self.time_jumps += self.content.builder.clock_went_back(now_ns)
 
     def set_options(self, options: EstimatorOptions) -> None:
-        """Change the options; what was built so far stays, and the next tick solves anew."""
+        """Change the options; what was built so far stays. If answers depend on them, the next tick solves anew."""
+        is_answer_other = options.for_answer != self.options.for_answer
         self.options = options
         self.content.builder.set_options(options)
-        self.content.solve_anew()
+        if is_answer_other:
+            self.content.solve_anew()
 
     def forget(self) -> None:
         """Begin with an empty content, whose answers go on counting up."""

@@ -187,7 +187,10 @@ class OnlineEstimator:
             return self._content.counts(self._current.time_jumps)
 
     def set_options(self, options: EstimatorOptions) -> None:
-        """Change the options; what was built so far stays, and the next tick solves anew."""
+        """Change the options; what was built so far stays.
+
+        The next tick solves anew if an answer depends on what has changed (:attr:`EstimatorOptions.for_answer`).
+        """
         with self._lock:
             self._current.set_options(options)
 

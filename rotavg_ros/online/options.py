@@ -162,6 +162,18 @@ class EstimatorOptions:
         }
 
     @property
+    def for_answer(self) -> dict[str, Any]:
+        """What of it an answer depends on besides the graph: the solver, its gauge and the flags.
+
+        The others only concern what comes in, or when to solve.
+        """
+        return self.for_solver | {
+            "gauge": self.gauge,
+            "translation_scale": self.translation_scale,
+            "outlier_threshold": self.outlier_threshold,
+        }
+
+    @property
     def most_edges(self) -> int:
         """Edges that the graph may have."""
         return min(self.max_edges, EDGES_PER_KEYFRAME * self.max_keyframes)

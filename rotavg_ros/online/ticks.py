@@ -105,7 +105,7 @@ class Ticks:
             )
         if problem.anew and not solution.is_anew:
             with current.lock:  # nothing but the solver's memory has changed
-                if options is current.options:
+                if options.for_answer == current.options.for_answer:
                     content.remember(solution.memory)
             return None
         component = solution.component.cpu()
@@ -130,7 +130,7 @@ class Ticks:
             content.accept(
                 AcceptedAnswer(body_from_world, component, answer.outlier, revision, was_cold, memory, known)
             )
-            if options is not current.options:
+            if options.for_answer != current.options.for_answer:
                 content.solve_anew()
         return answer
 

@@ -29,6 +29,36 @@ def test_options_that_change_during_a_solve_are_in_the_next_answer(solver):
     assert estimator.tick() is not None and estimator.tick() is None
 
 
+@pytest.mark.parametrize(
+    ("change", "is_answer_other"),
+    [
+        ({"stamp_tolerance_s": 0.2, "keyframe_interval_s": 0.2, "max_keyframes": 50, "warm_start": False}, False),
+        *(({name: value}, True) for name, value in (("outlier_threshold", 0.9), ("translation_scale", "none"))),
+        ({"method": "l1"}, True),
+    ],
+)
+def test_only_options_that_an_answer_depends_on_make_it_anew(solver, change: dict, is_answer_other: bool) -> None:
+    """Others leave the last answer, and what the solver remembers of it, whether they change before a tick or in it."""
+    remembered: list[object] = []
+
+    def remembering(*arguments: Any, memory: object = None, **options: Any) -> Any:
+        remembered.append(memory)
+        return replace(solver(*arguments, memory=memory, **options), memory=len(remembered))
+
+    run, estimator = drive(), make(remembering)
+    feed(estimator, run, stop=20)
+    final(estimator)
+    estimator.set_options(replace(OPTIONS, **change))
+    assert (estimator.tick() is not None) == is_answer_other
+    solver.on_call = lambda: estimator.set_options(OPTIONS)
+    feed(estimator, run, start=20, stop=30)
+    assert estimator.tick() is not None
+    solver.on_call = None
+    feed(estimator, run, start=30)
+    assert estimator.tick() is not None
+    assert (remembered[-1] is None) == is_answer_other
+
+
 def test_what_an_unfinished_solve_remembers_of_old_options_is_forgotten(solver):
     """It goes on from tick to tick until it is what a solve from scratch says; not where options changed within it."""
     remembered: list[object] = []
