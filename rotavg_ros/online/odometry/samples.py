@@ -16,7 +16,13 @@ from rotavg_ros.online.measurements import RejectedInputError, RejectReason
 from rotavg_ros.online.odometry.continuity import OdometrySample
 from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion, Vector
 
-_COLUMNS = ("stamp_ns", "world_from_body", "position", "is_keyframe", "chain", "time_line")
+_COLUMNS = ("stamp_ns", "world_from_body", "position", "is_keyframe", "chain", "time_line", "stood_still")
+# Between two messages whose poses differ by less, a robot stands still, as where odometry goes on after a restart.
+_STILL_ANGLE = math.radians(1.0)
+_STILL_DISTANCE_M = 0.1
+# Share of max_samples that stays though it is its turn to go, since without it some closures could not be placed. With
+# it, and without keyframes, at most 1.25 max_samples are kept.
+_SPARED = 1 / 16
 
 
 @dataclass(frozen=True)
@@ -25,8 +31,10 @@ class OdometryBounds:
 
     Attributes:
         tolerance_ns: a stamp this far before the first or after the last message takes that message's rotation.
-        max_gap_ns: there is no interpolation between two messages farther apart than this.
-        max_samples: beyond it, every second message of the older half that is not a keyframe is removed.
+        max_gap_ns: there is no interpolation between two messages farther apart than this, unless messages between
+            them were removed in which the robot stood still.
+        max_samples: beyond it, every second message of the older half that is not a keyframe is removed, apart from a
+            few without which such a gap would arise while the robot moved.
     """
 
     tolerance_ns: int
@@ -55,6 +63,7 @@ class OdometrySamples:
         # As wide as the values looked up in them: a search would copy narrower columns whole.
         self._chain = GrowingArray(np.int64)
         self._time_line = GrowingArray(np.int64)
+        self._stood_still = GrowingArray(np.bool_)  # in the messages that were removed between it and the one before
 
     def __len__(self) -> int:
         return len(self._stamp_ns)
@@ -69,6 +78,7 @@ class OdometrySamples:
         self._is_keyframe.append(False)
         self._chain.append(chain)
         self._time_line.append(time_line)
+        self._stood_still.append(False)
 
     def frozen(self) -> OdometrySamples:
         """A read-only copy of the messages so far, safe to read while others come and old ones are thinned out."""
@@ -172,7 +182,7 @@ class OdometrySamples:
                 raise RejectedInputError(RejectReason.ODOMETRY_GAP)
             return self._rotation(after - 1)
         gap = since_last + until_next
-        if gap > self.bounds.max_gap_ns:
+        if gap > self.bounds.max_gap_ns and not self._stood_still.view[after]:
             if min(since_last, until_next) > tolerance:
                 raise RejectedInputError(RejectReason.ODOMETRY_GAP)
             return self._rotation(after if until_next < since_last else after - 1)
@@ -226,6 +236,8 @@ class OdometrySamples:
     def from_arrays(cls, bounds: OdometryBounds, arrays: dict[str, NDArray[Any]]) -> OdometrySamples:
         """The messages that :meth:`arrays` came from."""
         samples = cls(bounds)
+        # Files of earlier versions do not have it.
+        arrays = {"stood_still": np.zeros(len(arrays["stamp_ns"]), dtype=bool)} | arrays
         for name in _COLUMNS:
             getattr(samples, f"_{name}").extend(arrays[name])
         samples._limit = max(bounds.max_samples, int(arrays["limit"]))
@@ -261,8 +273,34 @@ class OdometrySamples:
         size = len(self)
         keep = self._is_keyframe.view | (np.arange(size) % 2 == 0) | (np.arange(size) >= size // 2)
         keep |= np.diff(self._time_line.view, prepend=-1) != 0  # a time line never vanishes
+        goes, stood_still = self._spared(np.flatnonzero(~keep))
+        keep[:] = True
+        keep[goes] = False
+        flags = self._stood_still.view.copy()  # frozen copies share it
+        flags[goes + 1] = stood_still
+        self._stood_still.replace(flags)
         for name in _COLUMNS:
             column = getattr(self, f"_{name}")
             column.replace(column.view[keep])
         # If keyframes fill the room, the limit is raised; at least a quarter of it comes between two thinnings.
         self._limit = max(self.bounds.max_samples, int(keep.sum()) + self.bounds.max_samples // 4 + 1)
+
+    def _spared(self, goes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Rows ``(K,)`` that may go, each between two that stay → those that go, and whether the robot stood still.
+
+        A message without which a gap would arise while the robot moved is spared, the newest first.
+        """
+        is_still = self._stand_still()
+        stood_still = is_still[goes] & is_still[goes + 1]
+        gap_ns = self._stamp_ns.view[goes + 1] - self._stamp_ns.view[goes - 1]
+        needed = np.flatnonzero((gap_ns > self.bounds.max_gap_ns) & ~stood_still)
+        spared = needed[max(0, len(needed) - int(_SPARED * self.bounds.max_samples)) :]
+        return np.delete(goes, spared), np.delete(stood_still, spared)
+
+    def _stand_still(self) -> NDArray[np.bool_]:
+        """Whether the robot stood still, without a gap in odometry, from the message before to each one ``(n,)``."""
+        stamps, turns, positions = self._stamp_ns.view, self._world_from_body.view, self._position.view
+        is_same = np.abs(np.sum(turns[1:] * turns[:-1], axis=1)) > math.cos(_STILL_ANGLE / 2)
+        is_same &= ~(np.linalg.norm(np.diff(positions, axis=0), axis=1) > _STILL_DISTANCE_M)  # NaN: by rotation alone
+        is_same &= (np.diff(stamps) <= self.bounds.max_gap_ns) | self._stood_still.view[1:]
+        return np.append(False, is_same & (np.diff(self._chain.view) == 0))
