@@ -42,7 +42,7 @@ class Counts:
         odometry_robots: names of the robots whose odometry has come.
         pending_by_robot: number of edges that wait for each robot.
         longest_pending: the end that the longest-waiting edge waits for; None if none waits.
-        longest_pending_s: how long it has waited, seconds of the data's time.
+        longest_pending_s: how long it has waited, seconds of its robot's data time.
     """
 
     keyframes: int
@@ -261,7 +261,7 @@ class Content:
     def counts(self, time_jumps: int) -> Counts:
         """Present sizes and refusals."""
         growth = self.state.growth
-        longest = growth.pending.longest(growth.data_time.now_ns)
+        longest = growth.pending.longest(growth.now_ns)
         return Counts(
             keyframes=growth.graph.num_keyframes,
             edges=growth.graph.num_edges,

@@ -95,7 +95,7 @@ class CurrentContent:
 
     def clock_went_back(self, now_ns: int, from_ns: int | None) -> None:
         """The clock that stamps the data went back, see :meth:`OnlineEstimator.clock_went_back`; the options decide."""
-        tracks, data_time_ns = self.content.builder.tracks, self.content.state.growth.data_time.now_ns
+        tracks, data_time_ns = self.content.builder.tracks, self.content.state.growth.newest_ns
         if data_time_ns is None or data_time_ns - now_ns <= self.options.time_jump_ns:
             return  # no data from after it are known, or odometry has shown the jump already
         if self.options.on_time_jump == "reset":

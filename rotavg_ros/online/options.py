@@ -125,7 +125,9 @@ class EstimatorOptions:
     pending_capacity: int = option(
         20_000, "edges that may wait for a keyframe or for odometry; the oldest go first", within=(1, 10_000_000)
     )
-    pending_timeout_s: float = option(300.0, "how long they may wait, in the data's time", within=(0.0, 1e9))
+    pending_timeout_s: float = option(
+        300.0, "how long they may wait, in the data's time of the robot that they wait for", within=(0.0, 1e9)
+    )
     gauge: str = option(
         "odometry",
         "orientation of the first keyframe of a component: the odometry's, or identity",

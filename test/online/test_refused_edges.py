@@ -83,6 +83,22 @@ def test_edges_that_wait_in_vain_are_counted(solver):
     assert estimator.counts().pending == 0
 
 
+@pytest.mark.parametrize("lead_s", [0, 3600])
+def test_edges_wait_in_the_time_of_the_robot_that_they_wait_for(solver, lead_s: int) -> None:
+    """Whatever the clock of another robot says. Until a robot comes, edges wait for it in the other end's time."""
+    run, other = drive(), drive(seed=1)
+    estimator = make(solver, replace(OPTIONS, pending_timeout_s=1.5))
+    feed(estimator, run, stop=20)
+    estimator.add_edge(closure(run, 1, 0, 30))
+    between = replace(closure(run, 2, 9, 30), target=at(run.stamps[0] - SECOND, "absent"))
+    estimator.add_edge(between)
+    feed(estimator, replace(other, stamps=other.stamps + lead_s * SECOND), robot="s", stop=10)
+    assert estimator.counts().pending == 2 and estimator.counts().rejected == {}
+    feed(estimator, run, start=20)
+    assert estimator.counts().pending == 0 and estimator.counts().rejected == {"pending_timeout": 1}
+    assert 1 in estimator.snapshot().edge_id.tolist()
+
+
 def test_a_stamp_just_ahead_of_the_odometry_is_settled_when_the_input_is_silent(solver):
     run, estimator = drive(), make(solver)
     feed(estimator, run)

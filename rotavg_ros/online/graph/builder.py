@@ -81,7 +81,7 @@ class GraphBuilder:
         if chooses and track.reached(self._policy) and growth.has_room_for_keyframe():
             self._add_keyframe(robot, track)
         self._edges.place_all(growth.pending.pop_until(robot, message.stamp_ns))
-        growth.advance_data_time(message.stamp_ns)
+        growth.advance_data_time(robot, message.stamp_ns)
         self._edges.decide(robot)
         return None, []
 
@@ -104,9 +104,7 @@ class GraphBuilder:
         self._edges.end_time_line(robot)
         self.tracks[robot].begin_time_line()
         growth.refuse(RejectReason.OUT_OF_ORDER_ODOMETRY, -num_late)
-        going_on = [track.latest for track in self.tracks.values() if not track.begins_time_line]
-        growth.data_time.go_back(max((latest.stamp_ns for latest in going_on if latest is not None), default=None))
-        growth.pending.restart_timeouts()
+        growth.data_time_went_back(robot)
 
     def clock_went_back(self, now_ns: int) -> bool:
         """The clock that stamps the data went back: a new time line for every robot whose odometry is ahead of it.

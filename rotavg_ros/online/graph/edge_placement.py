@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 from rotavg_ros.online.graph.attachment import attach, between_keyframes
 from rotavg_ros.online.graph.growth import Growth
+from rotavg_ros.online.graph.pending import Waiting
 from rotavg_ros.online.graph.snapshot import GraphEdge
 from rotavg_ros.online.measurements import (
     OWN_EDGE_ID,
@@ -180,7 +181,16 @@ class EdgePlacement:
             growth.graph.add_keyframe(end.robot, keyframe_id, stamp_ns, time_line)
             self.place_all(growth.pending.pop_keyframe(end.robot, keyframe_id))
         if chosen_by_front_end:
-            growth.advance_data_time(max(end.stamp_ns or 0 for end in (edge.source, edge.target)))
+            self._advance_data_time(edge)
+
+    def _advance_data_time(self, edge: EdgeMeasurement) -> None:
+        """Advance the time of each robot that an edge is about, once: an edge alone does not confirm its stamps."""
+        newest_ns: dict[str, int] = {}
+        for end in (edge.source, edge.target):
+            if end.stamp_ns is not None:
+                newest_ns[end.robot] = max(end.stamp_ns, newest_ns.get(end.robot, 0))
+        for robot, stamp_ns in newest_ns.items():
+            self._growth.advance_data_time(robot, stamp_ns)
 
     def _place(self, edge: EdgeMeasurement, settle: bool = False) -> None:
         """Put an edge into the graph, or let it wait for its first end that is not there yet."""
@@ -214,6 +224,7 @@ class EdgePlacement:
 
     def _let_wait(self, edge: EdgeMeasurement, waits_for: KeyframeReference, is_undecided: bool = False) -> None:
         growth = self._growth
-        evicted = growth.pending.add(edge, waits_for, growth.data_time.now_ns, is_undecided)
+        timed_by = growth.timed_by(edge, waits_for)
+        evicted = growth.pending.add(Waiting(edge, waits_for, timed_by, growth.now_ns(timed_by), is_undecided))
         if evicted is not None:
             growth.give_up(evicted, RejectReason.PENDING_OVERFLOW)

@@ -34,7 +34,7 @@ class Growth:
         rejected: how many inputs were refused, by :class:`RejectReason`.
         labels: the users' verdicts, by source robot and edge id.
         room: what was taken out of a full graph.
-        data_time: newest stamp of odometry or of keyframes.
+        data_times: by robot, the newest stamp of its odometry or keyframes; the robots' clocks need not agree.
         given_up: ends of edges between keyframes by id that were refused for lack of room or time since the last
             request for them.
     """
@@ -49,7 +49,7 @@ class Growth:
     rejected: Counter[str] = field(default_factory=Counter)
     labels: dict[tuple[str, int], int] = field(default_factory=dict)
     room: Room = field(default_factory=Room)
-    data_time: DataTime = field(default_factory=DataTime)
+    data_times: dict[str, DataTime] = field(default_factory=dict)
     given_up: deque[tuple[KeyframeReference, KeyframeReference]] = field(
         default_factory=lambda: deque(maxlen=_MOST_GIVEN_UP)
     )
@@ -107,9 +107,30 @@ class Growth:
         begins = track is not None and (track.begins_time_line or track.awaits_time_line)
         return begins or self.backward_jumps.is_undecided(robot)
 
-    def advance_data_time(self, stamp_ns: int) -> None:
-        """Advance the data's time and give up edges that have waited too long."""
-        now_ns = self.data_time.advance(stamp_ns, self.options.continuity_limits.lead_ns)
+    def now_ns(self, robot: str) -> int | None:
+        """The data's time of a robot; None while it is not known."""
+        return None if (time := self.data_times.get(robot)) is None else time.now_ns
+
+    @property
+    def newest_ns(self) -> int | None:
+        """The data's time of the robot that is ahead; None while none is known."""
+        known = (time.now_ns for time in self.data_times.values())
+        return max((now_ns for now_ns in known if now_ns is not None), default=None)
+
+    def advance_data_time(self, robot: str, stamp_ns: int) -> None:
+        """Advance a robot's time and give up edges that have waited too long in it."""
+        time = self.data_times.setdefault(robot, DataTime())
+        now_ns = time.advance(stamp_ns, self.options.continuity_limits.lead_ns)
         if now_ns is not None:
-            for edge in self.pending.pop_expired(now_ns):
+            for edge in self.pending.pop_expired(robot, now_ns):
                 self.give_up(edge, RejectReason.PENDING_TIMEOUT)
+
+    def data_time_went_back(self, robot: str) -> None:
+        """A robot's time begins again with its next stamp, and so do the timeouts that count in it."""
+        self.data_times.setdefault(robot, DataTime()).go_back(None)
+        self.pending.restart_timeouts(robot)
+
+    def timed_by(self, edge: EdgeMeasurement, waits_for: KeyframeReference) -> str:
+        """The robot in whose time an edge waits: that of the awaited end, or of the other while only that is known."""
+        robots = waits_for.robot, edge.source.robot, edge.target.robot
+        return next((robot for robot in robots if self.now_ns(robot) is not None), waits_for.robot)

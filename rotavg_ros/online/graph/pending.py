@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right, insort
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 from rotavg_ros.online.measurements import MAX_STAMP_NS, EdgeMeasurement, KeyframeReference
@@ -17,14 +17,16 @@ class Waiting:
     Attributes:
         edge: the edge.
         waits_for: the end that is not there yet.
-        since_ns: start of the wait in data time; None while no data time is known.
+        timed_by: the robot in whose data time the wait counts.
+        since_ns: start of the wait in that robot's data time; None while it is not known.
         is_undecided: whether it waits until it is known to which time line the end's stamp belongs.
     """
 
     edge: EdgeMeasurement
     waits_for: KeyframeReference
+    timed_by: str
     since_ns: int | None
-    is_undecided: bool
+    is_undecided: bool = False
 
 
 class PendingEdges:
@@ -46,6 +48,7 @@ class PendingEdges:
         self._by_keyframe: dict[tuple[str, int], dict[int, None]] = {}
         self._by_stamp: dict[str, list[tuple[int, int]]] = {}  # per robot, ascending (stamp, serial)
         self._undecided: dict[str, dict[int, None]] = {}  # per robot
+        self._timed_by: dict[str, dict[int, None]] = {}  # per robot, in order of arrival
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -57,27 +60,28 @@ class PendingEdges:
     def __iter__(self) -> Iterator[EdgeMeasurement]:
         return (waiting.edge for waiting in self._waiting.values())
 
-    def longest(self, data_time_ns: int | None) -> tuple[KeyframeReference, int] | None:
-        """What the oldest edge waits for, and for how many nanoseconds of data time; None if none waits."""
-        first = next(iter(self._waiting.values()), None)
-        if first is None:
-            return None
-        if data_time_ns is None or first.since_ns is None:
-            return first.waits_for, 0
-        return first.waits_for, data_time_ns - first.since_ns
+    def longest(self, now_ns: Callable[[str], int | None]) -> tuple[KeyframeReference, int] | None:
+        """What the longest-waiting edge waits for, and for how many nanoseconds; None if none waits.
 
-    def add(
-        self,
-        edge: EdgeMeasurement,
-        waits_for: KeyframeReference,
-        data_time_ns: int | None,
-        is_undecided: bool = False,
-    ) -> EdgeMeasurement | None:
+        Args:
+            now_ns: data time of a robot; None while it is not known.
+        """
+        if not self._waiting:
+            return None
+        oldest = ((next(iter(serials)), now_ns(robot)) for robot, serials in self._timed_by.items())
+        waited_ns, serial = max((self._waited_ns(serial, now), -serial) for serial, now in oldest)
+        return self._waiting[-serial].waits_for, waited_ns
+
+    def _waited_ns(self, serial: int, now_ns: int | None) -> int:
+        since_ns = self._waiting[serial].since_ns
+        return 0 if now_ns is None or since_ns is None else now_ns - since_ns
+
+    def add(self, waiting: Waiting) -> EdgeMeasurement | None:
         """Let an edge wait for one of its ends; returns the edge removed to make room for it, if any."""
         evicted = None
         if len(self._waiting) >= self._capacity:
             evicted = self._remove(next(iter(self._waiting)))
-        self._add(Waiting(edge, waits_for, data_time_ns, is_undecided))
+        self._add(waiting)
         return evicted
 
     def _add(self, waiting: Waiting) -> None:
@@ -86,6 +90,7 @@ class PendingEdges:
         self._fingerprints.add(waiting.edge.fingerprint())
         reference = waiting.waits_for
         self.by_robot[reference.robot] += 1
+        self._timed_by.setdefault(waiting.timed_by, {})[self._serial] = None
         if waiting.is_undecided:
             self._undecided.setdefault(reference.robot, {})[self._serial] = None
         elif reference.keyframe_id is not None:
@@ -101,10 +106,10 @@ class PendingEdges:
         """Take out the edges that wait for a moment of a robot on a time line that has ended."""
         return self.pop_until(robot, MAX_STAMP_NS)
 
-    def restart_timeouts(self) -> None:
-        """Data time has changed: the timeouts of all waiting edges start again."""
-        for waiting in self._waiting.values():
-            waiting.since_ns = None
+    def restart_timeouts(self, robot: str) -> None:
+        """A robot's data time went back: the timeouts that count in it start again."""
+        for serial in self._timed_by.get(robot, ()):
+            self._waiting[serial].since_ns = None
 
     def pop_keyframe(self, robot: str, keyframe_id: int) -> list[EdgeMeasurement]:
         """Take out the edges that wait for a keyframe."""
@@ -118,10 +123,11 @@ class PendingEdges:
         ready = stamps[: bisect_right(stamps, (stamp_ns, self._serial))]
         return [self._remove(serial) for _, serial in ready]
 
-    def pop_expired(self, data_time_ns: int) -> list[EdgeMeasurement]:
-        """Take out the edges that have waited for longer than the timeout in data time."""
+    def pop_expired(self, robot: str, data_time_ns: int) -> list[EdgeMeasurement]:
+        """Take out the edges that have waited for longer than the timeout in a robot's data time."""
         expired = []
-        for serial, waiting in self._waiting.items():
+        for serial in self._timed_by.get(robot, ()):
+            waiting = self._waiting[serial]
             if waiting.since_ns is None:
                 waiting.since_ns = data_time_ns  # the clock starts with the first data
             elif data_time_ns - waiting.since_ns <= self._timeout_ns:
@@ -133,6 +139,9 @@ class PendingEdges:
     def _remove(self, serial: int) -> EdgeMeasurement:
         waiting = self._waiting.pop(serial)
         self._fingerprints.discard(waiting.edge.fingerprint())
+        del self._timed_by[waiting.timed_by][serial]
+        if not self._timed_by[waiting.timed_by]:
+            del self._timed_by[waiting.timed_by]
         reference = waiting.waits_for
         self.by_robot[reference.robot] -= 1
         if not self.by_robot[reference.robot]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass
 class DataTime:
-    """The data's time. A stamp far ahead counts only when a second one confirms it.
+    """The data's time, of one clock. A stamp far ahead counts only when a second one confirms it.
 
     Attributes:
         now_ns: newest stamp; None before the first, and again after time went back.

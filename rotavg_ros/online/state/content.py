@@ -91,7 +91,7 @@ def collect(content: ContentState) -> State:
         "revision": snapshot.revision,
         "robots": snapshot.robots,
         "odometry_robots": list(growth.tracks),
-        "data_time": asdict(growth.data_time),
+        "data_times": {robot: asdict(time) for robot, time in growth.data_times.items()},
         "backward_jumps": growth.backward_jumps.header(),
         "rejected": dict(growth.rejected),
         "room": asdict(growth.room),
@@ -165,7 +165,7 @@ def _restore(arrays: Arrays, header: dict[str, Any], options: EstimatorOptions) 
         Counter(header["rejected"]),
         {(robot, edge_id): label for robot, edge_id, label in header["labels"]},
         Room(**header["room"]),
-        DataTime(**header["data_time"]),
+        {robot: DataTime(**time) for robot, time in header["data_times"].items()},
     )
     builder = GraphBuilder(growth)
     for row in header.get("unplaced", ()):
@@ -215,7 +215,7 @@ def _forgotten(header: dict[str, Any]) -> Forgotten:
 def _pending(rows: list[dict[str, Any]], options: EstimatorOptions) -> PendingEdges:
     pending = PendingEdges(options.pending_capacity, options.pending_timeout_ns)
     pending.take(
-        Waiting(_edge(row["edge"]), KeyframeReference(**row["waits_for"]), row["since_ns"], row["is_undecided"])
+        Waiting(**(row | {"edge": _edge(row["edge"]), "waits_for": KeyframeReference(**row["waits_for"])}))
         for row in rows
     )
     return pending

@@ -18,8 +18,8 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.whole_file import real, replacing
 
 FORMAT = "rotavg online state"
-FORMAT_VERSION = 7
-_READABLE = (2, 3, 4, 5, 6, FORMAT_VERSION)
+FORMAT_VERSION = 8
+_READABLE = (2, 3, 4, 5, 6, 7, FORMAT_VERSION)
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -19,6 +19,8 @@ _FIRST_WITH_QUEUE = 5
 _FIRST_WITH_LABELS = 6
 # Before it, the only systematic error that was known was a gyroscope's bias.
 _FIRST_WITH_CALIBRATION = 7
+# Before it, the data's time was the newest stamp of all robots.
+_FIRST_WITH_DATA_TIMES = 8
 
 
 def upgraded(arrays: Arrays, header: dict[str, Any]) -> tuple[Arrays, dict[str, Any]]:
@@ -40,6 +42,8 @@ def upgraded(arrays: Arrays, header: dict[str, Any]) -> tuple[Arrays, dict[str, 
     if header["format_version"] < _FIRST_WITH_CALIBRATION and "labels_bias" in arrays:
         bias = arrays["labels_bias"]
         arrays = arrays | {"labels_calibration": np.append(bias, np.zeros(len(bias)))}
+    if header["format_version"] < _FIRST_WITH_DATA_TIMES:
+        header = _with_data_times(header, arrays)
     return arrays, header
 
 
@@ -73,7 +77,6 @@ def _with_surroundings(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]
         "ticked_revision": 0,
         "world_from_odometry": None,
         "revision": len(arrays["keyframe_id"]) + len(arrays["edge_id"]),
-        "data_time": {"now_ns": header["data_time_ns"], "claimed_ns": None},
         "backward_jumps": {"runs": {}, "told": []},
         "room": {
             "marginalized": header.get("marginalized", 0),
@@ -84,3 +87,14 @@ def _with_surroundings(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]
         "pending": [],
         "unplaced": header["pending"],
     }
+
+
+def _with_data_times(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
+    """Each robot's time is that of its last odometry; edges begin to wait anew, in the time of what they wait for."""
+    times = {
+        robot: {"now_ns": int(arrays[f"odometry{index}_stamp_ns"][-1]), "claimed_ns": None}
+        for index, robot in enumerate(header["odometry_robots"])
+        if not arrays[f"odometry{index}_begins_time_line"]
+    }
+    anew = [row | {"timed_by": row["waits_for"]["robot"], "since_ns": None} for row in header["pending"]]
+    return header | {"data_times": times, "pending": anew}

@@ -39,7 +39,7 @@ def as_of_version(path: Path, version: int) -> dict:
     room = header.pop("room")
     old = {
         "format_version": version,
-        "data_time_ns": header.pop("data_time")["now_ns"],
+        "data_time_ns": header.pop("data_times")["r"]["now_ns"],
         "pending": [row["edge"] for row in header["pending"]],
         "marginalized": room["marginalized"],
         "dropped_closures": room["dropped_closures"],
@@ -76,6 +76,25 @@ def test_it_goes_on(solver, tmp_path, version: int) -> None:
         np.testing.assert_allclose(getattr(second, name), getattr(first, name), atol=1e-12, err_msg=name)
     again.save(path)
     assert json.loads(state_file.read(path)["header"].tobytes())["format_version"] == state_file.FORMAT_VERSION
+
+
+def test_edges_of_a_file_with_one_data_time_wait_in_that_of_their_robot(solver, tmp_path) -> None:
+    """As version 7 wrote them; a robot whose clock is ahead had lengthened what they seem to have waited."""
+    today, path = OnlineEstimator(replace(OPTIONS, pending_timeout_s=30.0), solver), tmp_path / "state.npz"
+    feed(today, 0, 60)
+    today.add_edge(closure(6, KeyframeReference("r", 0), KeyframeReference("r", 1000)))
+    today.save(path)
+    arrays = state_file.read(path)
+    header = json.loads(arrays.pop("header").tobytes())
+    del header["data_times"], header["pending"][0]["timed_by"]
+    header |= {"format_version": 7, "data_time": {"now_ns": 5000 * SECOND, "claimed_ns": None}}
+    state_file.write(path, arrays | {"header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)})
+    again = OnlineEstimator(today.options, solver)
+    again.load(path)
+    feed(again, 60, 80)
+    assert again.counts().pending == 1
+    feed(again, 80, 95)
+    assert again.counts().pending == 0 and again.counts().rejected["pending_timeout"] == 1
 
 
 def test_without_labels_the_first_answer_is_from_nothing(tmp_path) -> None:
