@@ -132,6 +132,7 @@ class Content:
         self._frames: dict[str, OdometryFrame] = {}
         self._answered_revision = 0
         self._answer_was_cold = True
+        self._remembered_revision = self.builder.graph.revision
 
     @property
     def version(self) -> int:
@@ -236,7 +237,8 @@ class Content:
             last.queue.let_in(snapshot.graph, last.known, last.outlier, idle=idle)
         cold = force_cold or (is_last and not anew) or not self.builder.options.warm_start
         answered = last.body_from_world, last.component, last.outlier
-        return Problem(snapshot, cold, *answered, self.state.memory, last.queue.order, last.queue.prior_log_odds, anew)
+        remembered = self.state.memory, last.queue.order, last.queue.prior_log_odds
+        return Problem(snapshot, cold, *answered, *remembered, anew, self._are_tied_anew)
 
     def accept(self, answer: AcceptedAnswer) -> None:
         """Make the answer to the last problem the last answer."""
@@ -244,7 +246,7 @@ class Content:
         state.last.replace(answer.body_from_world, answer.component, answer.outlier, answer.known)
         # After a compaction only the labels in the memory fit the graph; the solver notices.
         self._answered_revision, self._answer_was_cold = answer.revision, answer.was_cold
-        state.memory = answer.memory
+        self.remember(answer.memory, answer.revision)
         state.version += 1
         assert self.answered is not None
         state.world_from_odometry = corrections(self.builder, self.answered)
@@ -254,9 +256,15 @@ class Content:
         """What the solver remembers of the last answer."""
         return self.state.memory
 
-    def remember(self, memory: object | None) -> None:
-        """Keep the solver's memory where the answer stays as it was."""
-        self.state.memory = memory
+    def remember(self, memory: object | None, revision: int) -> None:
+        """Keep the solver's memory of the graph at a revision."""
+        self.state.memory, self._remembered_revision = memory, revision
+
+    @property
+    def _are_tied_anew(self) -> bool:
+        """Whether edges that the solver remembers have been tied anew since, and their indices still hold."""
+        graph = self.builder.graph
+        return graph.tied_anew_at > self._remembered_revision >= graph.compacted_at
 
     def counts(self, time_jumps: int) -> Counts:
         """Present sizes and refusals."""

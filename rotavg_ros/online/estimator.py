@@ -220,7 +220,10 @@ class OnlineEstimator:
             return self._content.odometry_frame(robot)
 
     def snapshot(self) -> GraphSnapshot:
-        """The graph now. Until keyframes are marginalised a later one begins with the same keyframes and edges."""
+        """The graph now. Until keyframes are marginalised a later one begins with the same keyframes and edges.
+
+        Only edges that are tied to odometry's end, since it pauses, are tied anew once it goes on.
+        """
         with self._lock:
             return self._content.builder.graph.snapshot()
 

@@ -106,7 +106,7 @@ class Ticks:
         if problem.anew and not solution.is_anew:
             with current.lock:  # nothing but the solver's memory has changed
                 if options.for_answer == current.options.for_answer:
-                    content.remember(solution.memory)
+                    content.remember(solution.memory, snapshot.revision)
             return None
         component = solution.component.cpu()
         known = problem.known(solution, options.outlier_threshold)

@@ -13,6 +13,7 @@ from torch import Tensor
 from rotavg_ros.online.answer.gauge import extend_along_edges, joined, joins_components
 from rotavg_ros.online.answer.screening import Known, score_of
 from rotavg_ros.online.graph.snapshot import GraphSnapshot
+from rotavg_ros.solver import KeptLabels
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
 
@@ -35,6 +36,7 @@ class Problem:
         order: edges to solve, in the order in which they have entered; None: all, in their own order. The others wait.
         prior_log_odds: ``(M,)`` nats, of each waiting closure being good before its own residual counts.
         anew: nothing is new, and the answer is to become that of a solve from scratch.
+        are_tied_anew: whether some of the edges have been tied to other keyframes since :attr:`memory`.
     """
 
     snapshot: GraphSnapshot
@@ -46,6 +48,7 @@ class Problem:
     order: NDArray[np.int64] | None = None
     prior_log_odds: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     anew: bool = False
+    are_tied_anew: bool = False
 
     @cached_property
     def graph(self) -> ViewGraph:
@@ -68,7 +71,12 @@ class Problem:
 
     @cached_property
     def goes_on_from(self) -> object | None:
-        """The part of :attr:`memory` that the solver is given: only the labels where components have become one."""
+        """The part of :attr:`memory` that the solver is given.
+
+        Only the labels where components have become one, or edges have been tied anew.
+        """
+        if self.are_tied_anew:
+            return _labels_of_others(self.memory, self.graph)
         return getattr(self.memory, "labels", None) if self.joins else self.memory
 
     def warm_start(self) -> Tensor | None:
@@ -117,3 +125,17 @@ class Problem:
         if precision is not None:
             precision = precision.new_zeros(graph.num_edges, 2).cpu().index_copy(0, order, precision.cpu())
         return replace(solution, outlier_score=score, rotation_score=rotation_score, edge_precision=precision)
+
+
+def _labels_of_others(memory: object | None, graph: ViewGraph) -> KeptLabels | None:
+    """The labels in a solver's memory, without those of edges that are tied to other keyframes by now, or otherwise."""
+    kept: KeptLabels | None = getattr(memory, "labels", None)
+    if kept is None or len(kept.trusted) > graph.num_edges:
+        return None
+    pairs = [
+        (getattr(graph, name)[: len(kept.trusted)], getattr(kept.graph, name)[: len(kept.trusted)])
+        for name in ("source", "target", "target_from_source")
+    ]
+    moved = np.any([(now != before).reshape(len(now), -1).any(dim=1).numpy() for now, before in pairs], axis=0)
+    trusted, places = np.where(moved, np.nan, kept.trusted), np.where(moved, np.nan, kept.places)
+    return replace(kept, graph=graph, trusted=trusted, places=places)

@@ -25,7 +25,8 @@ class GraphBuilder:
 
     The graph depends on the messages of each robot's odometry in their order and on the set of edges, not on how
     they were interleaved. An edge by stamp waits until the odometry has reached the stamp, and is then tied to the
-    keyframe at or before it, with the odometry's motion in between taken out. Only where a robot's clock goes back
+    keyframe at or before it, with the odometry's motion in between taken out. In silence one that is slightly ahead is
+    tied to the odometry's end, but where it belongs as soon as odometry goes on. Only where a robot's clock goes back
     does the order matter, since from then on a stamp means the time line that has just begun.
 
     Attributes:
@@ -80,7 +81,7 @@ class GraphBuilder:
         chooses = self.options.keyframe_source == "odometry"
         if chooses and track.reached(self._policy) and growth.has_room_for_keyframe():
             self._add_keyframe(robot, track)
-        self._edges.place_all(growth.pending.pop_until(robot, message.stamp_ns))
+        self._edges.odometry_reached(robot, message.stamp_ns)
         growth.advance_data_time(robot, message.stamp_ns)
         self._edges.decide(robot)
         return None, []
@@ -135,7 +136,7 @@ class GraphBuilder:
         return self._edges.label(source_robot, edge_id, label, to_come)
 
     def settle(self) -> None:
-        """No more input is expected for now: tie edges slightly ahead of the odometry to its end."""
+        """No more input is expected for now: tie edges slightly ahead of the odometry to its end, until it goes on."""
         for robot in self.tracks:
             self._edges.settle(robot)
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import replace
 
 from rotavg_ros.online.graph.attachment import attach, between_keyframes
 from rotavg_ros.online.graph.growth import Growth
 from rotavg_ros.online.graph.pending import Waiting
+from rotavg_ros.online.graph.provisional import Provisional
 from rotavg_ros.online.graph.snapshot import GraphEdge
 from rotavg_ros.online.measurements import (
     OWN_EDGE_ID,
@@ -50,18 +53,18 @@ class EdgePlacement:
             return growth.refuse(rejection.reason)
         return None
 
-    def place_all(self, edges: Iterable[EdgeMeasurement], settle: bool = False) -> None:
-        """Take edges that have waited.
-
-        Args:
-            edges: checked before.
-            settle: whether odometry's last message stands for moments shortly after it.
-        """
+    def place_all(self, edges: Iterable[EdgeMeasurement]) -> None:
+        """Take edges that have waited, and were checked before."""
         for edge in edges:
             try:
-                self._place(edge, settle)
+                self._place(edge)
             except RejectedInputError as rejection:
                 self._growth.refuse(rejection.reason)
+
+    def odometry_reached(self, robot: str, stamp_ns: int) -> None:
+        """Take the edges that waited for a robot's odometry up to a stamp; place those exactly that were there."""
+        self.place_all(self._growth.pending.pop_until(robot, stamp_ns))
+        self._tie_anew(self._growth.provisional.pop_until(robot, stamp_ns))
 
     def decide(self, robot: str) -> None:
         """Take the edges that waited until it was known which time line a robot is on, if it is known now."""
@@ -73,14 +76,20 @@ class EdgePlacement:
         """No more odometry comes on a robot's time line: tie edges slightly ahead of its end to it, refuse the rest."""
         growth = self._growth
         self.settle(robot)
+        growth.provisional.end_time_line(robot)
         growth.refuse(RejectReason.STAMP_OUT_OF_RANGE, len(growth.pending.pop_of_time_line(robot)))
 
     def settle(self, robot: str) -> None:
-        """No more odometry is expected for now: tie edges slightly ahead of its end to it."""
+        """No more odometry is expected for now: tie edges slightly ahead of its end to it, until it goes on.
+
+        So does an edge that was tied to an earlier end: the graph then depends on the odometry, not on when it paused.
+        """
         growth, track = self._growth, self._growth.tracks[robot]
         if track.latest is not None and not track.begins_time_line:
             horizon_ns = track.latest.stamp_ns + growth.options.odometry_bounds.tolerance_ns
-            self.place_all(growth.pending.pop_until(robot, horizon_ns), settle=True)
+            for edge in growth.pending.pop_until(robot, horizon_ns):
+                self._settle(edge)
+            self._tie_anew(growth.provisional.pop_until(robot, horizon_ns))
 
     def label(self, source_robot: str, edge_id: int, label: EdgeLabel, to_come: int = 0) -> int:
         """Label all edges with this sender's id, waiting ones and later repetitions included; returns how many.
@@ -192,15 +201,64 @@ class EdgePlacement:
         for robot, stamp_ns in newest_ns.items():
             self._growth.advance_data_time(robot, stamp_ns)
 
-    def _place(self, edge: EdgeMeasurement, settle: bool = False) -> None:
+    def _place(self, edge: EdgeMeasurement) -> None:
         """Put an edge into the graph, or let it wait for its first end that is not there yet."""
+        tied = self._tied(edge)
+        if isinstance(tied, KeyframeReference):
+            self._let_wait(edge, tied)
+        else:
+            self._enter(edge, tied)
+
+    def _settle(self, edge: EdgeMeasurement) -> None:
+        """Put an edge whose stamps odometry may not have reached into the graph; its place is then provisional."""
+        growth = self._growth
+        try:
+            missing = self._tied(edge)
+            if not isinstance(missing, KeyframeReference):
+                self._enter(edge, missing)
+                return
+        except RejectedInputError as rejection:
+            growth.refuse(rejection.reason)
+            return
+        try:
+            tied = self._tied(edge, settle=True)
+        except RejectedInputError:  # odometry may show it to be fit, as one whose ends are not the same keyframe
+            tied = missing
+        if isinstance(tied, KeyframeReference):
+            self._let_wait(edge, tied)
+            return
+        growth.provisional.add(Provisional(edge, missing, growth.graph.num_edges))
+        self._enter(edge, tied)
+
+    def _tie_anew(self, edges: Iterable[Provisional]) -> None:
+        """Tie edges of the graph to where they belong by now, those for good that odometry has reached."""
+        growth, anew = self._growth, dict[int, GraphEdge]()
+        for each in edges:
+            with suppress(RejectedInputError):  # its place is the best there is
+                tied = self._tied(each.edge)
+                if isinstance(tied, KeyframeReference):
+                    growth.provisional.add(replace(each, waits_for=tied))
+                    tied = self._tied(each.edge, settle=True)
+                if isinstance(tied, GraphEdge):
+                    anew[each.row] = tied
+        growth.graph.tie_anew(anew)
+
+    def _tied(self, edge: EdgeMeasurement, settle: bool = False) -> GraphEdge | KeyframeReference:
+        """An edge between the keyframes that its ends are tied to, or its first end that is not there yet.
+
+        Args:
+            edge: checked before.
+            settle: whether odometry's last message stands for moments shortly after it.
+
+        Raises:
+            RejectedInputError: it cannot be tied to two keyframes.
+        """
         growth = self._growth
         ends = []
         for reference in (edge.source, edge.target):
             attachment = attach(reference, growth.graph, growth.tracks.get(reference.robot), settle)
             if attachment is None:
-                self._let_wait(edge, reference)
-                return
+                return reference
             ends.append(attachment)
         source, target = ends
         if edge.kind == EdgeKind.ODOMETRY and not (source.at_keyframe and target.at_keyframe):
@@ -208,19 +266,20 @@ class EdgePlacement:
         if source.node == target.node:
             raise RejectedInputError(RejectReason.SELF_EDGE)
         target_from_source, translation = between_keyframes(edge, source, target)
-        growth.graph.add_edge(
-            GraphEdge(
-                source.node,
-                target.node,
-                target_from_source,
-                edge.kind,
-                edge_id=edge.edge_id,
-                precision=edge.precision or math.nan,
-                label=growth.labels.get((edge.source.robot, edge.edge_id), EdgeLabel.AUTOMATIC),
-                translation=translation,
-            )
+        return GraphEdge(
+            source.node,
+            target.node,
+            target_from_source,
+            edge.kind,
+            edge_id=edge.edge_id,
+            precision=edge.precision or math.nan,
+            label=growth.labels.get((edge.source.robot, edge.edge_id), EdgeLabel.AUTOMATIC),
+            translation=translation,
         )
-        growth.fingerprints.add(self._fingerprint(edge))
+
+    def _enter(self, edge: EdgeMeasurement, tied: GraphEdge) -> None:
+        self._growth.graph.add_edge(tied)
+        self._growth.fingerprints.add(self._fingerprint(edge))
 
     def _let_wait(self, edge: EdgeMeasurement, waits_for: KeyframeReference, is_undecided: bool = False) -> None:
         growth = self._growth

@@ -35,6 +35,8 @@ _EDGE_COLUMNS = {
     "route": (np.int64, None),
 }
 _SOLVED_COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
+# What changes of an edge that is tied to other keyframes.
+_TIED_COLUMNS = ("source", "target", "target_from_source", "translation")
 # Share of all keyframes that are protected from compaction as the robots' latest.
 _LATEST_SHARE = 0.1
 
@@ -42,11 +44,18 @@ _LATEST_SHARE = 0.1
 class GrowingViewGraph:
     """Keyframes keyed by (robot, id) and the edges between them.
 
-    ``revision`` counts changes: equal revisions mean equal graphs. Not thread-safe.
+    Not thread-safe.
+
+    Attributes:
+        revision: counts changes: equal revisions mean equal graphs.
+        tied_anew_at, compacted_at: revisions since which edges, once there, have been tied to the same keyframes, and
+            nodes and edges have had the same indices.
+        robots: names, in the order in which they came.
+        marginalized: keyframes that are no longer nodes.
     """
 
     def __init__(self) -> None:
-        self.revision = 0
+        self.revision = self.tied_anew_at = self.compacted_at = 0
         self.robots: list[str] = []
         self.marginalized = MarginalizedIndex.of(MarginalizedKeyframes.none(), Forgotten())
         self._robot_index: dict[str, int] = {}
@@ -89,6 +98,23 @@ class GrowingViewGraph:
         for name, column in self._edge.items():
             column.append(getattr(edge, name))
         self.revision += 1
+
+    def tie_anew(self, edges: Mapping[int, GraphEdge]) -> None:
+        """Tie edges, by row, to the keyframes of these ones, with their rotations and translations."""
+        rows = [row for row, edge in edges.items() if not self._is_tied_as(row, edge)]
+        if not rows:
+            return
+        for name in _TIED_COLUMNS:
+            column = self._edge[name]
+            values = column.view.copy()  # snapshots keep what they have
+            values[rows] = [getattr(edges[row], name) for row in rows]
+            column.replace(values)
+        self.revision += 1
+        self.tied_anew_at = self.revision
+
+    def _is_tied_as(self, row: int, edge: GraphEdge) -> bool:
+        now = ((self._edge[name].view[row], getattr(edge, name)) for name in _TIED_COLUMNS)
+        return all(np.array_equal(one, other, equal_nan=True) for one, other in now)
 
     def label_edges(self, source_robot: str, edge_id: int, label: int) -> int:
         """Label every edge with the sender's id and source robot; returns how many there are."""
@@ -239,6 +265,7 @@ class GrowingViewGraph:
         known = MarginalizedIndex.of(contraction.marginalized, self.marginalized.forgotten)
         self.marginalized = known.limited_to(max_marginalized)
         self.revision += 1
+        self.compacted_at = self.revision
         edge_of = np.full(len(place), -1)
         edge_of[stays] = contraction.edge_of
         return Renumbering(contraction.kept, edge_of, stays[contraction.last], num_closures)

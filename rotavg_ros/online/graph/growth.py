@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from rotavg_ros.online.graph.fingerprints import Fingerprints
 from rotavg_ros.online.graph.growing_view_graph import GrowingViewGraph
 from rotavg_ros.online.graph.pending import PendingEdges
+from rotavg_ros.online.graph.provisional import ProvisionalEdges
 from rotavg_ros.online.graph.room import GraphsAnswer, Room
 from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference, RejectReason
 from rotavg_ros.online.odometry.data_time import DataTime
@@ -35,6 +36,7 @@ class Growth:
         labels: the users' verdicts, by source robot and edge id.
         room: what was taken out of a full graph.
         data_times: by robot, the newest stamp of its odometry or keyframes; the robots' clocks need not agree.
+        provisional: edges of the graph that are tied to the end of odometry until it goes on.
         given_up: ends of edges between keyframes by id that were refused for lack of room or time since the last
             request for them.
     """
@@ -50,6 +52,7 @@ class Growth:
     labels: dict[tuple[str, int], int] = field(default_factory=dict)
     room: Room = field(default_factory=Room)
     data_times: dict[str, DataTime] = field(default_factory=dict)
+    provisional: ProvisionalEdges = field(default_factory=ProvisionalEdges)
     given_up: deque[tuple[KeyframeReference, KeyframeReference]] = field(
         default_factory=lambda: deque(maxlen=_MOST_GIVEN_UP)
     )
@@ -87,7 +90,9 @@ class Growth:
 
     def _make_room(self) -> None:
         limits = self.options.max_keyframes, self.options.most_edges
-        if self.room.make(self.graph, *limits, self.answer, self._gone_on_from()):
+        renumbering = self.room.make(self.graph, *limits, self.answer, self._gone_on_from())
+        if renumbering is not None:
+            self.provisional.renumber(renumbering)
             for robot, track in self.tracks.items():
                 track.samples.release_keyframes(*self.graph.moments(robot))
 

@@ -60,8 +60,8 @@ class Room:
 
     def make(
         self, graph: GrowingViewGraph, max_keyframes: int, max_edges: int, answer: GraphsAnswer, needed: Sequence[int]
-    ) -> bool:
-        """Take keyframes and closures that can be spared out of a full graph; returns whether there were any.
+    ) -> Renumbering | None:
+        """Take keyframes and closures that can be spared out of a full graph; returns None if there were none.
 
         Args:
             graph: the graph, full or not.
@@ -75,7 +75,7 @@ class Room:
             for size, limit, from_revision in zip(sizes, limits, self.compact_from_revision, strict=True)
         ]
         if not any(surplus):
-            return False
+            return None
         remembered = max(_REMEMBERED * max_keyframes, _REMEMBERED_AT_LEAST)
         renumbering = graph.compact(surplus[0], surplus[1], answer.verdict, remembered, needed)
         gained = sizes[0] - graph.num_keyframes, sizes[1] - graph.num_edges
@@ -83,8 +83,8 @@ class Room:
             if surplus[index] and gained[index] < max(1, _WORTHWHILE * limit):
                 self.compact_from_revision[index] = graph.revision + max(1, round((1 - _FILL) * limit))
         if renumbering is None:
-            return False
+            return None
         self.marginalized += gained[0]
         self.dropped_closures += renumbering.num_dropped
         answer.renumber(renumbering)
-        return True
+        return renumbering

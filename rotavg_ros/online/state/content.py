@@ -23,6 +23,7 @@ from rotavg_ros.online.graph.fingerprints import Fingerprints
 from rotavg_ros.online.graph.growing_view_graph import GrowingViewGraph
 from rotavg_ros.online.graph.growth import Growth
 from rotavg_ros.online.graph.pending import PendingEdges, Waiting
+from rotavg_ros.online.graph.provisional import Provisional, ProvisionalEdges
 from rotavg_ros.online.graph.room import Room
 from rotavg_ros.online.graph.snapshot import GraphSnapshot
 from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference
@@ -95,6 +96,7 @@ def collect(content: ContentState) -> State:
         "backward_jumps": growth.backward_jumps.header(),
         "rejected": dict(growth.rejected),
         "room": asdict(growth.room),
+        "provisional": [asdict(each) for each in growth.provisional.all()],
         "forgotten_up_to": list(marginalized.forgotten.ids.items()),
         "forgotten_stamps": [[*key, stamp_ns] for key, stamp_ns in marginalized.forgotten.stamps_ns.items()],
         "labels": [[robot, edge_id, int(label)] for (robot, edge_id), label in growth.labels.items()],
@@ -166,6 +168,7 @@ def _restore(arrays: Arrays, header: dict[str, Any], options: EstimatorOptions) 
         {(robot, edge_id): label for robot, edge_id, label in header["labels"]},
         Room(**header["room"]),
         {robot: DataTime(**time) for robot, time in header["data_times"].items()},
+        _provisional(header["provisional"], graph.num_edges),
     )
     builder = GraphBuilder(growth)
     for row in header.get("unplaced", ()):
@@ -219,6 +222,14 @@ def _pending(rows: list[dict[str, Any]], options: EstimatorOptions) -> PendingEd
         for row in rows
     )
     return pending
+
+
+def _provisional(rows: list[dict[str, Any]], num_edges: int) -> ProvisionalEdges:
+    if not all(0 <= row["row"] < num_edges for row in rows):
+        raise ValueError("a provisional edge that is not there")
+    return ProvisionalEdges(
+        Provisional(_edge(row["edge"]), KeyframeReference(**row["waits_for"]), row["row"]) for row in rows
+    )
 
 
 def _edge(row: dict[str, Any]) -> EdgeMeasurement:

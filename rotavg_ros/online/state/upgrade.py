@@ -19,7 +19,7 @@ _FIRST_WITH_QUEUE = 5
 _FIRST_WITH_LABELS = 6
 # Before it, the only systematic error that was known was a gyroscope's bias.
 _FIRST_WITH_CALIBRATION = 7
-# Before it, the data's time was the newest stamp of all robots.
+# Before it, the data's time was the newest stamp of all robots, and an edge tied to odometry's end stayed there.
 _FIRST_WITH_DATA_TIMES = 8
 
 
@@ -97,4 +97,4 @@ def _with_data_times(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
         if not arrays[f"odometry{index}_begins_time_line"]
     }
     anew = [row | {"timed_by": row["waits_for"]["robot"], "since_ns": None} for row in header["pending"]]
-    return header | {"data_times": times, "pending": anew}
+    return header | {"data_times": times, "pending": anew, "provisional": []}
