@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pickle
 import signal
@@ -24,8 +25,10 @@ from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig,
 from rotavg_ros.errors import UserError
 from rotavg_ros.odometry_route import Routes
 from rotavg_ros.online import EstimatorOptions, OnlineEstimator
+from rotavg_ros.online.solver_process import client as client_module
 from rotavg_ros.online.solver_process import server as server_module
 from rotavg_ros.online.solver_process.client import SolverProcess
+from rotavg_ros.online.solver_process.process import Spawned
 from rotavg_ros.online.solver_process.wire import Request, to_arrays
 from rotavg_ros.solver import Abandoned, abandonable
 from rotavg_ros.view_graph import ViewGraph
@@ -139,6 +142,46 @@ def test_a_process_that_dies_is_an_error_and_the_next_solve_starts_another():
             solver(large, **OPTIONS)
     finally:
         solver.close()
+
+
+def kill(solver: SolverProcess) -> None:
+    """End its process as a lack of memory does, and wait until this side can know."""
+    os.kill(solver.pid, signal.SIGKILL)
+    while solver.is_alive:
+        time.sleep(0.01)
+
+
+def test_a_process_that_cannot_be_started_is_an_error_and_each_solve_tries_again(monkeypatch):
+    solver, small, fails = SolverProcess(threads=1), graph(30), [True, True, False]
+
+    def spawned() -> Spawned:
+        if fails.pop(0):
+            raise OSError(errno.ENOMEM, "Cannot allocate memory")
+        return Spawned()
+
+    monkeypatch.setattr(client_module, "Spawned", spawned)
+    try:
+        kill(solver)
+        for _ in range(2):
+            with pytest.raises(UserError, match=r"cannot be started \(Cannot allocate memory\); the next solve tries"):
+                solver(small, **OPTIONS)
+            assert not solver.is_alive
+        assert solver(small, **OPTIONS).method == "neurora" and not fails
+    finally:
+        solver.close()
+    with pytest.raises(UserError, match="the solver's process was closed"):
+        solver(small, **OPTIONS)
+
+
+def test_a_start_that_fails_leaves_no_descriptors(monkeypatch):
+    def no_memory(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+    monkeypatch.setattr(subprocess, "Popen", no_memory)
+    before = os.listdir("/proc/self/fd")
+    with pytest.raises(OSError, match="Cannot allocate memory"):
+        Spawned()
+    assert os.listdir("/proc/self/fd") == before
 
 
 @pytest.mark.large

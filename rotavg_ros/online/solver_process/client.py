@@ -55,7 +55,8 @@ class SolverProcess:
         self._lock = threading.Lock()
         self._solves = self._first = 0
         self._routes: Tensor | None = None
-        self._begin(process or Spawned())
+        self._is_over = False
+        self._begin(process or _spawned())
         atexit.register(self.close)
 
     def _begin(self, process: ServerProcess) -> None:
@@ -66,7 +67,9 @@ class SolverProcess:
     @property
     def is_alive(self) -> bool:
         """Whether the process is running, as far as this side knows; only meaningful between solves."""
-        return not self._process.connection.poll(0)  # nothing was asked, so anything readable is the end of the stream
+        connection = self._process.connection
+        # Nothing was asked, so anything readable is the end of the stream.
+        return not connection.closed and not connection.poll(0)
 
     @property
     def pid(self) -> int:
@@ -83,15 +86,12 @@ class SolverProcess:
         """See :func:`rotavg_ros.solve`.
 
         Raises:
-            UserError: as there, or the process has died.
+            UserError: as there; or the process has died, or no other can be started in its place.
             Abandoned: the solution is no longer wanted.
         """
         with self._lock:
             if not self.is_alive:
-                self.close()
-                self._begin(Spawned())
-                self._first = self._solves + 1
-                self._routes = None
+                self._begin_again()
             self._solves += 1
             request = Request(self._solves, self._told(graph), None, None, options)
             if isinstance(memory, _Remembered) and memory.number >= self._first:
@@ -110,6 +110,15 @@ class SolverProcess:
                 with suppress(ValueError):  # the answer is as good without them
                     kept = KeptLabels.of_arrays(graph, labels)
             return replace(solution, memory=_Remembered(request.number, kept))
+
+    def _begin_again(self) -> None:
+        """Replace a process that has ended; where that fails, the next solve tries it again."""
+        if self._is_over:
+            raise UserError("the solver's process was closed")
+        self._process.close()
+        self._begin(_spawned())
+        self._first = self._solves + 1
+        self._routes = None
 
     def _told(self, graph: ViewGraph) -> dict[str, Any]:
         """A graph's fields; routes, which only change with a thinning, are sent once."""
@@ -157,5 +166,15 @@ class SolverProcess:
         return outcome
 
     def close(self) -> None:
-        """End the process, even in the middle of a solve."""
+        """End the process for good, even in the middle of a solve."""
+        self._is_over = True
         self._process.close()
+
+
+def _spawned() -> ServerProcess:
+    try:
+        return Spawned()
+    except OSError as error:  # no memory, most often: what ended the process before
+        raise UserError(
+            f"the solver's process cannot be started ({error.strerror}); the next solve tries it again"
+        ) from error

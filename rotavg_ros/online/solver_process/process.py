@@ -45,13 +45,18 @@ class Spawned:
     """Another interpreter, which takes a second or two to be ready."""
 
     def __init__(self) -> None:
+        """Start it.
+
+        Raises:
+            OSError: there is no memory, process or file descriptor left for it.
+        """
         ours, theirs = socket.socketpair()
-        with theirs:
+        with ours, theirs:  # where it cannot be started, neither end is left
             server = [sys.executable, "-c", _SERVER, str(theirs.fileno())]
             # Ctrl-C is for the asking process, which ends this one itself.
             command = ["/bin/sh", "-c", 'trap "" INT; exec "$@"', "sh", *server]
             self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()])
-        self.connection = Connection(ours.detach())
+            self.connection = Connection(ours.detach())
 
     @property
     def pid(self) -> int:
