@@ -93,14 +93,19 @@ def test_routes_are_told_once_and_again_when_they_change(process, monkeypatch):
     assert torch.equal(answers[0], answers[1]) and not torch.allclose(answers[1], answers[2], rtol=0, atol=1e-9)
 
 
-def test_it_remembers_its_last_solution_and_no_other(process):
+def test_it_remembers_its_last_solution_and_of_others_only_the_labels_are_left(process, monkeypatch):
     whole = graph()
     first = process(grown(whole, 298), **OPTIONS)
     start = torch.cat((first.body_from_world, first.body_from_world[-1:]))
     second = process(grown(whole, 299), warm_start=start, memory=first.memory, **OPTIONS)
     assert "update" in second.stage_seconds
-    again = process(grown(whole, 299), warm_start=start, memory=first.memory, **OPTIONS)
-    assert "update" not in again.stage_seconds
+    requests, dumps = [], pickle.dumps
+    monkeypatch.setattr(pickle, "dumps", lambda request, **how: requests.append(request) or dumps(request, **how))
+    for memory in (second.memory, first.memory):
+        again = process(grown(whole, 299), warm_start=start, memory=memory, **OPTIONS)
+        assert "update" in again.stage_seconds
+    assert [request.remembered is not None for request in requests] == [True, False]
+    assert [request.labels is not None for request in requests] == [False, True]
 
 
 def test_mistakes_are_told_as_in_this_process(process):
@@ -123,6 +128,38 @@ def test_a_solve_that_nobody_wants_ends_soon_and_the_next_one_is_right(process):
     small = graph(30)
     there = process(small, **OPTIONS)
     np.testing.assert_allclose(there.body_from_world.numpy(), solve(small, **OPTIONS).body_from_world.numpy())
+
+
+class _Unseen:
+    """A connection on which whoever waits does not see at first that the answer has come."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection, self.closed, self._has_looked = connection, False, False
+
+    def poll(self, timeout: float) -> bool:
+        if timeout == 0:  # whether it is alive
+            return False
+        while not self._connection.poll(timeout):
+            pass
+        seen, self._has_looked = self._has_looked, True
+        return seen
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._connection, name)
+
+
+def test_a_solve_that_is_abandoned_just_as_it_ends_leaves_the_next_one_the_labels(process, monkeypatch):
+    whole = graph()
+    first = process(grown(whole, 298), **OPTIONS)
+    start = torch.cat((first.body_from_world, first.body_from_world[-1:]))
+    connection = process._process.connection
+    monkeypatch.setattr(process._process, "connection", _Unseen(connection))
+    with pytest.raises(Abandoned), abandonable(lambda: True):
+        process(grown(whole, 299), warm_start=start, memory=first.memory, **OPTIONS)
+    monkeypatch.setattr(process._process, "connection", connection)
+    second = process(grown(whole, 299), warm_start=start, memory=first.memory, **OPTIONS)
+    assert set(second.stage_seconds) == {"update"}
+    assert ((first.outlier_score > 0.5) != (second.outlier_score[: len(first.outlier_score)] > 0.5)).sum() <= 1
 
 
 def test_a_process_that_dies_is_an_error_and_the_next_solve_starts_another():

@@ -28,7 +28,7 @@ class _Remembered:
 
     Attributes:
         number: of the solve.
-        labels: all that is left of it if the process dies.
+        labels: all that is left of it once the process has died, or remembers another solve.
     """
 
     number: int
@@ -41,7 +41,8 @@ class SolverProcess:
     Python runs one thread at a time, so a solve of small steps in the same process delays each odometry message by
     milliseconds, and by a hundred on a busy machine. Here only arrays come and go. What a solve remembers for the next
     one stays in the other process, except for the labels. If that process dies, the solve fails, and the next one
-    starts another process, which continues from the labels.
+    starts another process, which continues from the labels. So does a solve after one that was abandoned just as it
+    ended, which has taken the place of what was remembered before.
     """
 
     def __init__(self, threads: int, process: ServerProcess | None = None) -> None:
@@ -53,7 +54,8 @@ class SolverProcess:
         """
         self._threads = threads
         self._lock = threading.Lock()
-        self._solves = self._first = 0
+        self._solves = 0
+        self._held = 0  # number of the solve whose memory the process has
         self._routes: Tensor | None = None
         self._is_over = False
         self._begin(process or _spawned())
@@ -94,7 +96,7 @@ class SolverProcess:
                 self._begin_again()
             self._solves += 1
             request = Request(self._solves, self._told(graph), None, None, options)
-            if isinstance(memory, _Remembered) and memory.number >= self._first:
+            if isinstance(memory, _Remembered) and memory.number == self._held:
                 request.remembered = memory.number
             elif isinstance(memory, _Remembered | KeptLabels) and (kept := memory.labels) is not None:
                 request.labels = kept.arrays(), to_arrays(kept.graph)
@@ -117,8 +119,7 @@ class SolverProcess:
             raise UserError("the solver's process was closed")
         self._process.close()
         self._begin(_spawned())
-        self._first = self._solves + 1
-        self._routes = None
+        self._held, self._routes = 0, None
 
     def _told(self, graph: ViewGraph) -> dict[str, Any]:
         """A graph's fields; routes, which only change with a thinning, are sent once."""
@@ -158,11 +159,18 @@ class SolverProcess:
                 stop_if_abandoned()
             except Abandoned:
                 self._process.connection.send_bytes(ABANDON)
-                self._process.connection.recv_bytes()  # the answer may just have become ready; it is dropped
+                self._received(request)  # the answer may just have become ready; it is dropped
                 raise
-        outcome = pickle.loads(self._process.connection.recv_bytes())  # noqa: S301 - of our own process
+        outcome = self._received(request)
         if isinstance(outcome, BaseException):
             raise outcome
+        return outcome
+
+    def _received(self, request: Request | Advance) -> Any:
+        """What the process sends: the outcome, or the exception in which the work ended."""
+        outcome = pickle.loads(self._process.connection.recv_bytes())  # noqa: S301 - of our own process
+        if isinstance(request, Request) and not isinstance(outcome, BaseException):
+            self._held = request.number
         return outcome
 
     def close(self) -> None:
