@@ -221,6 +221,22 @@ def test_a_start_that_fails_leaves_no_descriptors(monkeypatch):
     assert os.listdir("/proc/self/fd") == before
 
 
+@pytest.mark.parametrize("work", ["a solve", "the work after it"])
+def test_a_process_that_hangs_is_ended_once_nobody_waits_and_the_next_solve_starts_another(work, monkeypatch):
+    monkeypatch.setattr(client_module, "_LAST_WORD_S", 0.5)
+    solver, small = SolverProcess(threads=1), graph(30)
+    try:
+        memory, before = solver(small, **OPTIONS).memory, solver.pid
+        os.kill(before, signal.SIGSTOP)
+        with pytest.raises(UserError, match="has hung"), abandonable(lambda: True):
+            solver(small, **OPTIONS) if work == "a solve" else solver.advance(memory, 100.0)
+        assert not solver.is_alive and not Path(f"/proc/{before}").exists()
+        assert solver.advance(memory, 100.0) == 0.0
+        assert solver(small, memory=memory, **OPTIONS).method == "neurora" and solver.pid != before
+    finally:
+        solver.close()
+
+
 @pytest.mark.large
 def test_another_process_goes_on_from_the_labels_of_one_that_has_died():
     solver, whole = SolverProcess(threads=1), graph()

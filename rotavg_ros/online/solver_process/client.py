@@ -20,6 +20,9 @@ from rotavg_ros.view_graph import ViewGraph
 # Interval, in seconds, of checks whether the solve that is under way is still wanted.
 _PATIENCE_S = 0.02
 _EXIT_TIMEOUT_S = 5.0
+# A process that was told to give up is ended if nothing has come from it for this long, in seconds. Between two of its
+# looks at whether it is wanted lies a factorisation (seconds at 100 000 keyframes), or the compilation of a function.
+_LAST_WORD_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ class SolverProcess:
         """See :func:`rotavg_ros.solve`.
 
         Raises:
-            UserError: as there; or the process has died, or no other can be started in its place.
+            UserError: as there; or the process has died or hangs, or no other can be started in its place.
             Abandoned: the solution is no longer wanted.
         """
         with self._lock:
@@ -134,7 +137,7 @@ class SolverProcess:
         """See :func:`rotavg_ros.solver.advance`.
 
         Raises:
-            UserError: the process has died.
+            UserError: the process has died or hangs.
             Abandoned: the work is no longer wanted.
         """
         if not isinstance(memory, _Remembered):
@@ -158,13 +161,28 @@ class SolverProcess:
             try:
                 stop_if_abandoned()
             except Abandoned:
-                self._process.connection.send_bytes(ABANDON)
-                self._received(request)  # the answer may just have become ready; it is dropped
+                self._abandon(request)
                 raise
         outcome = self._received(request)
         if isinstance(outcome, BaseException):
             raise outcome
         return outcome
+
+    def _abandon(self, request: Request | Advance) -> None:
+        """Let the process give up, and drop its last word, which may be the answer.
+
+        Raises:
+            UserError: it hangs, and was ended.
+        """
+        connection = self._process.connection
+        connection.send_bytes(ABANDON)
+        if not connection.poll(_LAST_WORD_S):
+            self._process.close()
+            raise UserError(
+                f"the solver's process has hung: nothing came for {_LAST_WORD_S:.0f} s after it was told to give up; "
+                "it is started again"
+            )
+        self._received(request)
 
     def _received(self, request: Request | Advance) -> Any:
         """What the process sends: the outcome, or the exception in which the work ended."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -155,6 +156,7 @@ class RotavgNode(parameter_server.ParameterNode):
         self._saver.submit(lambda: self._solving.back_up_quietly(discarded))
 
     def _on_diagnostics_timer(self) -> None:
+        self._health.compared(time.monotonic(), self._estimator.is_behind)
         self._health.waiting_for_frames = self._listening.waiting_for_frames
         wiring = self._wiring.warnings(self._settings)
         self._health.held_back = self._forwarding.waiting

@@ -30,7 +30,7 @@ class Health:
         joins: how often components became one.
         held_back: number of closures that wait to be sent on (``forward_topics``).
         held_back_dropped: number of closures that will not be sent on, because too many waited.
-        unsolved_since: since when the graph has been ahead of the answer; None if it is not.
+        unsolved_since: since when the graph has been ahead of the answer; None if it was not at the last comparison.
         solve_failures: number of ticks that have failed so far.
         failure: error message of the last tick; None if it succeeded.
         save_failure: why the last save failed; None if it succeeded.
@@ -83,10 +83,19 @@ class Health:
         """An odometry message was refused."""
         self.last_refusal[topic] = time.monotonic(), reason
 
-    def fell_behind(self) -> None:
-        """The graph has changed since the answer; the first such call sets :attr:`unsolved_since`."""
-        if self.unsolved_since is None:
-            self.unsolved_since = time.monotonic()
+    def compared(self, began: float, is_behind: bool) -> None:
+        """The graph was compared with the answer; decides :attr:`unsolved_since`.
+
+        The worker does not: it may be what hangs.
+
+        Args:
+            began: when the comparison began; an answer that is published during it counts at the next one.
+            is_behind: whether the graph has changed since the answer.
+        """
+        if self.unsolved_since is not None and self.answered is not None and self.answered >= self.unsolved_since:
+            self.unsolved_since = None
+        if self.unsolved_since is None and is_behind:
+            self.unsolved_since = began
 
     def waits_for_nothing(self) -> None:
         """No answer is due."""
@@ -108,7 +117,7 @@ class Health:
     def published(self, answer: Answer) -> None:
         """An answer was published."""
         self.ticks.add(answer.seconds)
-        self.answer, self.answered, self.unsolved_since = answer, time.monotonic(), None
+        self.answer, self.answered = answer, time.monotonic()
 
     def forget_answer(self) -> None:
         """The last answer was forgotten."""

@@ -74,8 +74,6 @@ class Solving:
     def tick(self, force_cold: bool = False) -> Answer | None:
         """Solve if there is anything new, and publish the answer; None if there is none."""
         health = self._health
-        if self._estimator.is_behind:
-            health.fell_behind()
         try:
             answer = self._estimator.tick(force_cold, self._budget.units(_BEFORE * self.tick_budget_s))
         except TickAbandonedError:

@@ -75,6 +75,18 @@ def test_what_is_wrong_is_said(health: Health, changes: dict[str, object], level
     assert status.level == level and message in status.message
 
 
+def test_an_answer_is_stale_from_the_first_comparison_that_finds_it_behind(health: Health) -> None:
+    health.answered, *looks = (time.monotonic() - before for before in (200.0, 100.0, 50.0))
+    for began in looks:
+        health.compared(began, is_behind=True)
+    assert health.unsolved_since == looks[0] and "stale by 100 s" in report(health).message
+    health.published(answer(seconds=0.1))  # while the third comparison is on its way
+    health.compared(looks[1], is_behind=True)
+    assert health.unsolved_since == looks[1]
+    health.compared(time.monotonic(), is_behind=False)
+    assert health.unsolved_since is None and report(health).level == OK
+
+
 @pytest.mark.parametrize(
     ("seconds", "level", "message"), [(30.0, WARN, "code is compiled"), (400.0, ERROR, "stale by 400 s")]
 )

@@ -19,13 +19,13 @@ pytestmark = pytest.mark.ros
 EVERY_MESSAGE = ("keyframe_angle_deg:=0.0", "keyframe_distance_m:=0.0", "solve_period_s:=0.1")
 OK, WARN, ERROR = 0, 1, 2
 
-# The node with a solver that does what a file says: "fail", "hang", or else its work.
+# The node with a solver that does what a file says: "fail", "hang", "hang after an answer", or else its work.
 SABOTAGED = """
 import sys, time
 from pathlib import Path
 import rotavg_ros.solver
 from rotavg_ros.ros.node.main import main
-order, solve = Path(sys.argv.pop(1)), rotavg_ros.solver.solve
+order, solve, advance = Path(sys.argv.pop(1)), rotavg_ros.solver.solve, rotavg_ros.solver.advance
 
 def sabotaged(*arguments, **options):
     if order.read_text() == "fail":
@@ -34,7 +34,13 @@ def sabotaged(*arguments, **options):
         time.sleep(0.05)
     return solve(*arguments, **options)
 
-rotavg_ros.solver.solve = sabotaged
+def sabotaged_after(*arguments):
+    while order.read_text() == "hang after an answer":
+        order.with_name("hangs").touch()
+        time.sleep(0.05)
+    return advance(*arguments)
+
+rotavg_ros.solver.solve, rotavg_ros.solver.advance = sabotaged, sabotaged_after
 sys.exit(main())
 """
 
@@ -77,7 +83,7 @@ def test_a_solver_that_fails_or_hangs_stops_nothing_else(live_node, tmp_path: Pa
     order = tmp_path / "order"
     order.write_text("work")
     # A period that no solve exceeds on a busy machine, which would be warned of for a minute.
-    options = (*EVERY_MESSAGE, "solver_process:=false", "solve_period_s:=1.0")
+    options = (*EVERY_MESSAGE, "solver_process:=false", "solve_period_s:=1.0", "odometry_timeout_s:=1000.0")
     live_node.start(*options, command=[sys.executable, "-c", SABOTAGED, order])
     live_node.turn(0, 10)
     live_node.wait_for_silence()
@@ -92,9 +98,16 @@ def test_a_solver_that_fails_or_hangs_stops_nothing_else(live_node, tmp_path: Pa
     assert int(live_node.status["solve failures"]) > 0 and len(live_node.wait_for_silence().keyframe_ids) == 20
     assert "Traceback" not in live_node.process.output
 
-    order.write_text("hang")
+    order.write_text("hang after an answer")
+    live_node.spin_until(order.with_name("hangs").exists)
     live_node.turn(20, 30)
     says(live_node, ERROR, "the answer is stale")
-    live_node.spin_until(lambda: len(live_node.orientations) == 30)
+    order.write_text("work")
+    says(live_node, OK, "ok")
+
+    order.write_text("hang")
+    live_node.turn(30, 40)
+    says(live_node, ERROR, "the answer is stale")
+    live_node.spin_until(lambda: len(live_node.orientations) == 40)
     assert live_node.stop(signal.SIGTERM) == 0
     assert "Traceback" not in live_node.process.output
