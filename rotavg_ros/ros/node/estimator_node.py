@@ -45,12 +45,18 @@ class RotavgNode(parameter_server.ParameterNode):
         UserError: invalid parameters; the message is one line for the user.
     """
 
-    def __init__(self, executor: Executor, process: ServerProcess | None = None) -> None:
+    def __init__(
+        self,
+        executor: Executor,
+        process: ServerProcess | None = None,
+        on_resuming: Callable[[], object] | None = None,
+    ) -> None:
         """Declare the parameters, start the solver and subscribe.
 
         Args:
             executor: runs the callbacks of the workers' futures.
             process: the process that solves; default: another interpreter, if the parameters ask for one.
+            on_resuming: called before the state file is locked; until then there is nothing to clean up.
         """
         try:
             super().__init__(NODE_NAME)
@@ -74,6 +80,8 @@ class RotavgNode(parameter_server.ParameterNode):
         listened = replace(parameters, edge_frames_from_tf=from_tf)
         listening = Subscriptions(self, listened, self._estimator, self._health, self._outputs, self._on_time_jump)
         self._listening, self._forwarding = listening, listening.forwarding
+        if on_resuming is not None:
+            on_resuming()
         self._solving = Solving(self, self._estimator, self._health, self._outputs, self._forwarding, parameters)
         self._solving.tick_budget_s = parameters.tick_budget_s
         workers = Workers(solver=self._worker, saver=self._saver)

@@ -92,9 +92,9 @@ def _run(stop: _StopSignal, process: ServerProcess) -> int:
     except ModuleNotFoundError as error:
         return _fail_without(error)
     executor = SingleThreadedExecutor()
-    stop.has_started()  # the node locks its state file, which must not be left behind
     try:
-        node = RotavgNode(executor, process)
+        # Only from when the node locks its state file is there something to clean up; its warm-up takes seconds.
+        node = RotavgNode(executor, process, stop.has_started)
     except UserError as error:
         return _fail(str(error))
     executor.add_node(node)

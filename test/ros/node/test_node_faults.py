@@ -155,6 +155,34 @@ def answer_to_good_stream() -> Answer:
     return answer
 
 
+# The node with a solver that never comes out of its warm-up, once it has noted that it is in it.
+STARTING = """
+import sys, time
+from pathlib import Path
+import rotavg_ros.solver
+from rotavg_ros.ros.node.main import main
+note = Path(sys.argv.pop(1))
+
+def never(*arguments, **options):
+    note.touch()
+    while True:
+        time.sleep(0.05)
+
+rotavg_ros.solver.solve = never
+sys.exit(main())
+"""
+
+
+def test_a_node_that_is_starting_ends_at_once(start_process, wait_until, tmp_path: Path) -> None:
+    note, state_file = tmp_path / "warming up", tmp_path / "state.npz"
+    options = [word for option in ("solver_process:=false", f"state_file:={state_file}") for word in ("-p", option)]
+    node = start_process(sys.executable, "-c", STARTING, note, "--ros-args", *options)
+    wait_until(note.exists, node)
+    assert node.stop(signal.SIGTERM, timeout=60.0) == 0
+    assert list(tmp_path.glob("*state.npz*")) == []
+    assert "Traceback" not in node.output
+
+
 def test_a_thousand_malformed_messages_are_counted_by_reason_and_change_nothing(live_node) -> None:
     """Mixed into a good stream, on every topic."""
     live_node.start(*EVERY_MESSAGE, "pending_capacity:=1000")
