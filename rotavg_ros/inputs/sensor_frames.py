@@ -18,6 +18,8 @@ from rotavg_ros.online.quaternion import IDENTITY, Quaternion, Vector
 
 # Most frames remembered; beyond, new ones are assumed to be nonsense.
 _MOST_FRAMES = 10_000
+# Mountings on two robots that differ by less are alike, radians and metres: closures err by as much.
+_ALIKE_RAD, _ALIKE_M = math.radians(1.0), 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +53,12 @@ class Mounting:
             target_from_source=quaternion.inverse(of_body.orientation),
             translation=None if edge.translation is None else of_body.position,
         )
+
+    def is_like(self, other: Mounting, *, with_position: bool) -> bool:
+        """Whether another mounting may take the place of this one."""
+        turned = quaternion.angle_between(self.orientation, other.orientation)
+        moved = math.dist(self.position, other.position) if with_position else 0.0
+        return turned <= _ALIKE_RAD and moved <= _ALIKE_M
 
     @staticmethod
     def _position_of(edge: EdgeMeasurement) -> Vector:
@@ -97,6 +105,36 @@ class SensorFrames:
                 self._found.clear()
             self._found[robot, sensor] = self._search(robot, _name(sensor))
         return self._found[robot, sensor]
+
+    def unlike(self, edge: EdgeMeasurement, sensor: str) -> str | None:
+        """The warning about an edge between two robots on which a sensor is known to be mounted differently.
+
+        An edge names one frame, and is converted by its mounting on the source's robot at both ends.
+
+        Args:
+            edge: as it was measured.
+            sensor: the frame that it names.
+
+        Returns:
+            None if there is nothing to warn of, or one of the mountings is not known.
+        """
+        source, target = edge.source.robot, edge.target.robot
+        if source == target or source not in self._bodies or target not in self._bodies:
+            return None
+        here = self.body_from(source, sensor)
+        there = self.body_from(target, sensor) or self.body_from(target, self._namesake(source, target, sensor))
+        if here is None or there is None or here.is_like(there, with_position=edge.translation is not None):
+            return None
+        return (
+            f"{_name(sensor)} is mounted differently on {source} and on {target}; closures between them are taken as "
+            f"if it were mounted as on {source} at both ends: send them between the bodies, without frame_id"
+        )
+
+    def _namesake(self, source: str, target: str, sensor: str) -> str:
+        """The target's frame of that name, where names begin with the robot's and a '/': b/camera for a/camera."""
+        (own, _), (other, _) = self._bodies[source], self._bodies[target]
+        beginning = own[: own.rfind("/") + 1]
+        return other[: other.rfind("/") + 1] + _name(sensor).removeprefix(beginning)
 
     def _search(self, robot: str, sensor: str) -> Mounting | None:
         if robot not in self._bodies:

@@ -23,6 +23,7 @@ class BagFrames:
         self._is_on = plan.edge_frames_from_tf
         self._sensors, self._bodies = SensorFrames(), set[str]()
         self._unknown: dict[str, dict[str, None]] = {}
+        self._unlike: str | None = None
         for _, _, message in bag.decoded(static_transforms(bag.topics) if self._is_on else []):
             self._sensors.take(message)
         parameters = plan.parameters
@@ -37,14 +38,23 @@ class BagFrames:
             return edge
         body_from_sensor = self._sensors.body_from(edge.source.robot, frame)
         if body_from_sensor is not None:
+            self._compare_ends(edge, frame, topic)
             return body_from_sensor.edge_of_body(edge)
         self._unknown.setdefault(topic, {})[frame] = None
         return edge
 
+    def _compare_ends(self, edge: EdgeMeasurement, frame: str, topic: str) -> None:
+        unlike = self._sensors.unlike(edge, frame) if self._unlike is None else None
+        if unlike is not None:
+            self._unlike = f"{topic}: {unlike}"
+
     @property
     def warnings(self) -> list[str]:
-        """One line for each topic with edges that were taken as they are, although odometry is of another frame."""
-        lines, bodies = [], ", ".join(sorted(self._bodies))
+        """One line for each topic with edges that were taken as they are, although odometry is of another frame.
+
+        And one about the first edge between robots whose sensors are mounted differently.
+        """
+        lines, bodies = [] if self._unlike is None else [self._unlike], ", ".join(sorted(self._bodies))
         for topic, frames in self._unknown.items() if self._bodies else ():
             named = ", ".join(list(frames)[:3])
             lines.append(

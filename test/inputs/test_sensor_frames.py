@@ -101,6 +101,42 @@ def test_transforms_are_chained_up_and_down_the_tree() -> None:
     assert frames.body_from("a", "elsewhere") is None and frames.body_from("b", "camera") is None
 
 
+def between(source: str, target: str, translation: tuple[float, float, float] | None = None) -> EdgeMeasurement:
+    ends = KeyframeReference(source, 1), KeyframeReference(target, 1)
+    return EdgeMeasurement.from_ros(7, *ends, (0.0, 0.0, 0.0, 1.0), translation)
+
+
+@pytest.mark.parametrize(
+    ("bodies", "camera"),
+    [(("a/base_link", "b/base_link"), "a/camera"), (("base_link", "imu"), "camera")],
+    ids=["frames of each robot", "frames of one name"],
+)
+def test_a_sensor_that_is_mounted_differently_on_two_robots_is_told_of(bodies: tuple[str, str], camera: str) -> None:
+    forward, turned = matrix(Rotation.identity(), [0.3, 0.0, 0.0]), matrix(QUARTER_ABOUT_Z, [0.3, 0.0, 0.0])
+    frames = SensorFrames()
+    for robot, body in zip("ab", bodies, strict=True):
+        frames.note_body(robot, body)
+    frames.take(message(transform(bodies[0], camera, forward)))
+    assert frames.unlike(between("a", "b"), camera) is None  # nobody knows yet
+    if bodies[1] == "imu":
+        frames.take(message(transform("base_link", "imu", turned)))
+    else:
+        frames.take(message(transform("b/base_link", "b/camera", turned)))
+    told = frames.unlike(between("a", "b"), camera)
+    assert told is not None and f"{camera} is mounted differently on a and on b" in told
+    assert frames.unlike(between("a", "a"), camera) is None and frames.unlike(between("a", "c"), camera) is None
+
+
+def test_a_lever_arm_counts_where_translations_are_told() -> None:
+    frames = SensorFrames()
+    for robot, height in (("a", 0.3), ("b", 1.1)):
+        frames.note_body(robot, f"{robot}/base")
+        frames.take(message(transform(f"{robot}/base", f"{robot}/lidar", matrix(Rotation.identity(), [0, 0, height]))))
+    assert frames.unlike(between("a", "b"), "a/lidar") is None
+    assert frames.unlike(between("a", "b", (1.0, 0.0, 0.0)), "a/lidar") is not None
+    assert frames.unlike(between("a", "b", (1.0, 0.0, 0.0)), "a/base") is None
+
+
 def test_an_edge_of_the_body_is_left_as_it_is() -> None:
     frames = SensorFrames()
     frames.note_body("a", "")

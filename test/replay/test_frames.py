@@ -56,15 +56,15 @@ def closure(number: int) -> Any:
     return message
 
 
-def static_transform() -> Any:
+def static_transform(parent: str = "base_link", child: str = "camera", turned: Rotation = CAMERA) -> Any:
     types = typestore().types
-    qx, qy, qz, qw = CAMERA.as_quat().tolist()
+    qx, qy, qz, qw = turned.as_quat().tolist()
     x, y, z = LEVER.tolist()
     transform = types["geometry_msgs/msg/Transform"](
         types["geometry_msgs/msg/Vector3"](x, y, z), types["geometry_msgs/msg/Quaternion"](qx, qy, qz, qw)
     )
-    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](sec=0, nanosec=0), "base_link")
-    return types[TF]([types["geometry_msgs/msg/TransformStamped"](header, "camera", transform)])
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](sec=0, nanosec=0), parent)
+    return types[TF]([types["geometry_msgs/msg/TransformStamped"](header, child, transform)])
 
 
 def write_bag(path: Path, with_tf: bool, nameless: int = 0) -> None:
@@ -132,3 +132,41 @@ def test_an_orientation_that_was_given_wins(tmp_path: Path, with_tf: bool) -> No
     degrees, _ = residuals(tmp_path / "out")
     # The camera's place is not told, and its lever bends the path a little.
     assert (degrees < 1e-2).all() and summary["warnings"] == [] and "/tf_static" not in summary["topics"]
+
+
+def write_meeting(path: Path, robots: dict[str, Rotation]) -> None:
+    """Robots that drive alike and see each other, by cameras that are turned on their bodies by these rotations."""
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = {**{f"/{robot}/odom": ODOMETRY for robot in robots}, "/between": RELATIVE_ROTATION, "/tf_static": TF}
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=typestore()) for topic, kind in topics.items()
+        }
+
+        def write(topic: str, second: int, message: Any) -> None:
+            writer.write(connections[topic], stamp(second), typestore().serialize_cdr(message, topics[topic]))
+
+        for robot, turned in robots.items():
+            write("/tf_static", 0, static_transform(f"{robot}/base_link", f"{robot}/camera", turned))
+        for second in range(SECONDS):
+            rotation, here = body(second)
+            for robot in robots:
+                message = odometry_message(stamp(second), here, rotation.as_quat(), "odom")
+                message.child_frame_id = f"{robot}/base_link"
+                write(f"/{robot}/odom", second, message)
+        ends = [Keyframe(None, stamp(1), robot) for robot in robots]
+        for number in range(2):
+            edge = edge_message(Edge(stamp(SECONDS), number, number + 1, *ends, np.array([0.0, 0, 0, 1]), 1e4, 1))
+            edge.header.frame_id = "red/camera"
+            write("/between", SECONDS, edge)
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_cameras_that_two_robots_carry_differently_are_warned_of_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], alike: bool
+) -> None:
+    write_meeting(tmp_path / "bag", {"red": CAMERA, "blue": CAMERA if alike else CAMERA.inv()})
+    topics = ["--odometry", "/red/odom", "--odometry", "/blue/odom"]
+    summary = replayed(tmp_path / "bag", tmp_path / "out", *topics)
+    told = "/between: red/camera is mounted differently on red and on blue"
+    assert sum(told in warning for warning in summary["warnings"]) == (not alike)
+    assert capsys.readouterr().err.count(told) == (not alike)

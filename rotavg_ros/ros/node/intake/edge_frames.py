@@ -140,6 +140,9 @@ class EdgeFrames:
                 "~/reset to begin anew without them"
             )
         topic.note_placement(edge.source.robot, frame, Placement.KNOWN)
+        unlike = self._sensors.unlike(edge, frame)
+        if unlike is not None:
+            self._node.get_logger().warning(f"{topic.name}: {unlike}", once=True)
         self._add(replace(waiting.record, edge=body_from_sensor.edge_of_body(edge)), topic)
         return True
 

@@ -186,9 +186,10 @@ class Intake:
         self.frames.note_body("r", "base_link", (0.0, 0.0, 0.0, 1.0))
         self._topic = Input("/edges", "any", "edge_topics", "", QoSProfile(depth=1))
 
-    def take(self, number: int) -> None:
-        edge = EdgeMeasurement(number, Reference("r", number), Reference("r", number + 1), (0.0, 0.0, 0.0, 1.0))
-        self.frames.take(EdgeRecord(edge, frame_id="camera"), self._topic)
+    def take(self, number: int, frame: str = "camera", robots: tuple[str, str] = ("r", "r")) -> None:
+        source, target = (Reference(robot, number + later) for later, robot in enumerate(robots))
+        edge = EdgeMeasurement(number, source, target, (0.0, 0.0, 0.0, 1.0))
+        self.frames.take(EdgeRecord(edge, frame_id=frame), self._topic)
 
 
 @pytest.fixture
@@ -216,15 +217,30 @@ def test_edges_that_flow_do_not_keep_the_first_waiting(executor: SingleThreadedE
     assert intake.handed_on[0].edge.edge_id == 0
 
 
+def placed(parent: str, child: str, turned: Rotation) -> SimpleNamespace:
+    """A static transform, as ``tf2_msgs/TFMessage``."""
+    transform = SimpleNamespace(rotation=xyzw(turned), translation=Point())
+    header = SimpleNamespace(frame_id=parent)
+    return SimpleNamespace(transforms=[SimpleNamespace(header=header, child_frame_id=child, transform=transform)])
+
+
 def test_a_transform_is_the_moment_to_look(executor: SingleThreadedExecutor) -> None:
     intake = Intake(executor, wait_s=1000.0)
     intake.take(0)
-    placed = SimpleNamespace(
-        header=SimpleNamespace(frame_id="base_link"),
-        child_frame_id="camera",
-        transform=SimpleNamespace(
-            rotation=SimpleNamespace(x=0.0, y=0.0, z=1.0, w=0.0), translation=SimpleNamespace(x=0.0, y=0.0, z=0.0)
-        ),
-    )
-    intake.frames.note_transforms(SimpleNamespace(transforms=[placed]))
+    intake.frames.note_transforms(placed("base_link", "camera", MAST))
     assert len(intake.handed_on) == 1 and intake.frames.waiting == 0
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_cameras_that_two_robots_carry_differently_are_warned_of_once(
+    executor: SingleThreadedExecutor, capfd: pytest.CaptureFixture[str], alike: bool
+) -> None:
+    intake = Intake(executor, wait_s=1000.0)
+    for robot, turned in (("red", MAST), ("blue", MAST if alike else CAMERAS["about x"])):
+        intake.frames.note_body(robot, f"{robot}/base_link", (0.0, 0.0, 0.0, 1.0))
+        intake.frames.note_transforms(placed(f"{robot}/base_link", f"{robot}/camera", turned))
+    for number in range(3):
+        intake.take(number, "red/camera", ("red", "blue"))
+    assert len(intake.handed_on) == 3
+    told = "/edges: red/camera is mounted differently on red and on blue"
+    assert capfd.readouterr().err.count(told) == (not alike)
