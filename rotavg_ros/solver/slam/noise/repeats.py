@@ -75,17 +75,31 @@ class Repeats(NamedTuple):
         return cls(np.zeros((_WHOSE, KERNELS, count)), np.zeros((_WHOSE, count), dtype=np.bool_))
 
 
-def repeats(closures: Closures, near: Near, gap: float, components: int) -> Repeats:
+def repeats(closures: Closures, near: Near, gap: float, components: int, narrowest: float) -> Repeats:
     """Estimates for some closures.
+
+    What is mistaken again is measured again, with the noise of a closure, so kernels are no narrower than that.
+    Narrower ones make right closures false that all contradict odometry by exactly the same turn.
 
     Args:
         closures: all closures.
         near: n of them, and the false ones that they are compared with.
         gap: steps; ends at most this far apart are near each other.
         components: k.
+        narrowest: rad, least standard deviation of the difference between repeats.
     """
     density, total = _repeats(closures, near, gap, _Kernels.of(components))
+    _widen(density, narrowest)
     return Repeats(density, total > 0)
+
+
+def _widen(density: np.ndarray, narrowest: float) -> None:
+    """Replace kernels narrower than ``narrowest``, in place, by the mixture of both widths next to it."""
+    place = np.clip(np.log2(max(np.degrees(narrowest), REPEAT_DEG[0]) / REPEAT_DEG[0]), 0, len(REPEAT_DEG) - 1)
+    below = min(int(place), len(REPEAT_DEG) - 2)
+    share = place - below
+    density[:, : below + 1] = ((1 - share) * density[:, below] + share * density[:, below + 1])[:, None]
+    density[:, -1] = density[:, :-1].mean(axis=1)
 
 
 class _Kernels(NamedTuple):

@@ -10,7 +10,7 @@ from scipy.special import expit
 from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
 from rotavg_ros.solver.slam.posterior.densities import beyond, log_false, log_good, log_slipped
-from rotavg_ros.solver.slam.posterior.labels.false_closures import false_density, if_false, log_false_set
+from rotavg_ros.solver.slam.posterior.labels.false_closures import Discrepancies, false_density, if_false, log_false_set
 from rotavg_ros.solver.slam.posterior.labels.prior import label_log_odds, log_label_prior, log_slip_odds
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import residuals, sites, tails, variances, with_others
@@ -54,7 +54,7 @@ def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> Lef
     # The prior's log-odds, minus the log density of the edge if it is not good.
     odds = problem.log_odds.copy()
     is_false = ~state.is_good[closure]
-    told_false, alone = if_false(problem, is_false, residual[closure], told.others.predicted[closure])
+    told_false, alone = if_false(problem, is_false, Discrepancies.of(problem, told, residual))
     label_odds = label_log_odds(problem, is_false)
     odds[closure] = label_odds - np.log(told_false)
     odometry = np.flatnonzero(graph.is_odometry)
@@ -109,8 +109,8 @@ def rough_cost(problem: Problem, state: State) -> float:
     odometry = problem.graph.is_odometry
     told = np.where(state.is_good, good, otherwise)[odometry].sum() + good[closure[~is_false]].sum()
     told -= np.clip(problem.log_odds, -CERTAIN, CERTAIN)[closure[~is_false]].sum()  # counted with the labels
-    predicted = state.others.predicted[closure]
-    density = false_density(problem, is_false, residuals(problem, state)[closure], predicted, np.flatnonzero(is_false))
+    off = Discrepancies.of(problem, state, residuals(problem, state))
+    density = false_density(problem, is_false, off, np.flatnonzero(is_false))
     return -float(told) - log_false_set(problem, density) - log_label_prior(problem, is_false)
 
 

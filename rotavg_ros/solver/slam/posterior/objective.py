@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rotavg_ros.solver.slam.posterior.densities import log_normal, log_slipped
-from rotavg_ros.solver.slam.posterior.labels.false_closures import false_density, log_false_set
+from rotavg_ros.solver.slam.posterior.labels.false_closures import Discrepancies, false_density, log_false_set
 from rotavg_ros.solver.slam.posterior.labels.prior import log_label_prior, log_slip_prior
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
@@ -91,8 +91,7 @@ def evaluate(problem: Problem, state: State, *, is_moving: bool = False) -> Eval
     slipped = np.flatnonzero(graph.is_odometry & ~good)
     log_if_slipped = log_slipped(square[slipped], own[slipped], 0.0, k, priors)
     is_false = ~good[problem.closure]
-    predicted = told.others.predicted[problem.closure]
-    false = false_density(problem, is_false, residual[problem.closure], predicted, np.flatnonzero(is_false))
+    false = false_density(problem, is_false, Discrepancies.of(problem, told, residual), np.flatnonzero(is_false))
     unknowns = system.size - len(graph.roots)
     terms = {
         "odometry": -float(log_if_good[graph.is_odometry & good].sum()),

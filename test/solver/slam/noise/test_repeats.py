@@ -27,7 +27,7 @@ def test_densities_are_means_over_a_run_those_before_and_all(
     is_told, false = rng.random(count) < 0.9, np.flatnonzero(rng.random(count) < 0.7)
     rows = np.arange(count)
     between = places_near(false, rows, np.isin(rows, false) if both_sides else None, WINDOW)
-    found = repeats(Closures(older, newer, turn.as_quat(), is_told), Near(rows, false, between), GAP, components)
+    found = repeats(Closures(older, newer, turn.as_quat(), is_told), Near(rows, false, between), GAP, components, 0.0)
 
     width = np.radians(REPEAT_DEG)
     for row in rows:
@@ -58,3 +58,20 @@ def test_nobody_is_near_itself() -> None:
     near = places_near(when, rows, np.isin(rows, when), 2)
     assert near.tolist() == [[0, 0, 1, 3], [0, 1, 1, 3], [0, 1, 2, 3], [1, 3, 3, 3]]
     assert places_near(when, rows, None, 2)[:, 2:].tolist() == [[3, 3]] * 4
+
+
+@pytest.mark.parametrize("narrowest", [0.0, 0.05, 0.3, 0.4, 20.0])
+def test_no_kernel_is_narrower_than_a_repeat_is_measured(narrowest: float) -> None:
+    """Widths below it are replaced by the mixture of the two next to it, at their distances in octaves."""
+    apart = np.radians([0.0, 0.02, 0.5, 3.0])
+    for angle in apart:
+        turn = Rotation.from_rotvec([[0, 0, 0.0], [0, 0, angle]]).as_quat()
+        closures = Closures(np.array([0.0, 1.0]), np.array([500.0, 501.0]), turn, np.ones(2, dtype=bool))
+        near = Near(np.array([1]), np.array([0]), np.array([[0, 1, 1, 1]]))
+        plain = repeats(closures, near, GAP, 1, 0.0).density[:, :, 0]
+        found = repeats(closures, near, GAP, 1, np.radians(narrowest)).density[:, :, 0]
+        octave = np.clip(np.log2(max(narrowest, 1e-9) / REPEAT_DEG[0]), 0, KERNELS - 2)
+        each = np.maximum(np.arange(KERNELS - 1), octave)
+        expected = np.stack([np.interp(each, np.arange(KERNELS - 1), own[:-1]) for own in plain])
+        np.testing.assert_allclose(found[:, :-1], expected, rtol=1e-9)
+        np.testing.assert_allclose(found[:, -1], expected.mean(axis=1), rtol=1e-9)

@@ -11,7 +11,12 @@ from scipy.special import logsumexp
 
 from rotavg_ros.solver.slam.noise.repeats import Repeats
 from rotavg_ros.solver.slam.posterior.densities import log_false
-from rotavg_ros.solver.slam.posterior.labels.false_closures import FalseDensity, false_density, log_false_set
+from rotavg_ros.solver.slam.posterior.labels.false_closures import (
+    Discrepancies,
+    FalseDensity,
+    false_density,
+    log_false_set,
+)
 from rotavg_ros.solver.slam.posterior.labels.prior import label_log_odds, log_label_prior, log_slip_prior
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.view_graph import ViewGraph
@@ -53,7 +58,9 @@ def test_priors_are_normalised() -> None:
     for turn in turns:
         residual = np.zeros((len(problem.closure), 3))
         residual[second, 2] = turn
-        densities.append(np.exp(false_density(problem, is_false, residual, exact, second).log_sums()))
+        densities.append(
+            np.exp(false_density(problem, is_false, Discrepancies(residual, exact, 0.0), second).log_sums())
+        )
     np.testing.assert_allclose(np.trapezoid(densities, turns, axis=0), 1.0, atol=0.02)
     chain = problem_of(ViewGraph.create(np.arange(6), np.arange(1, 7), yaw(np.zeros(6)), kind=[0] * 6))
     # Every node an end of closures would make six segments of one step; here their prior is asked for as if.
@@ -118,7 +125,7 @@ def test_runs_that_repeat_one_turn_are_cheap_though_others_repeat_none() -> None
         residual = np.stack((np.zeros(26), np.zeros(26), turn), axis=1)
         for name, is_false in (("both", np.ones(26, dtype=bool)), ("scattered", is_scattered)):
             rows = np.flatnonzero(is_false)
-            density = false_density(problem, is_false, residual, np.zeros(26), rows)
+            density = false_density(problem, is_false, Discrepancies(residual, np.zeros(26), 0.0), rows)
             cost[name, without] = -log_false_set(problem, density)
     repeating = [cost["both", without] - cost["scattered", without] for without in ((), ("own-repeats",))]
     assert repeating[0] < repeating[1] - 2.0

@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from rotavg_ros.solver.slam.posterior.em import polish
-from rotavg_ros.solver.slam.posterior.labels.false_closures import FalseDensity, false_density, repeat_rates
+from rotavg_ros.solver.slam.posterior.labels.false_closures import (
+    Discrepancies,
+    FalseDensity,
+    false_density,
+    repeat_rates,
+)
 from rotavg_ros.solver.slam.posterior.labels.prior import label_log_odds
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.moves.noise import tuned
@@ -58,7 +63,9 @@ def _repeated(problem: Problem) -> FalseDensity:
     first, second = problem.detection[:2]
     is_false = np.arange(len(problem.closure)) == first
     count = len(problem.closure)
-    return false_density(problem, is_false, np.zeros((count, 3)), np.zeros(count), np.array([second]))
+    return false_density(
+        problem, is_false, Discrepancies(np.zeros((count, 3)), np.zeros(count), 0.0), np.array([second])
+    )
 
 
 def _stickiness(problem: Problem) -> float:

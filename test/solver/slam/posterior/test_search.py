@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.stress.drawn import DrawnGraph
@@ -443,3 +444,21 @@ def test_no_mode_that_the_search_ends_with_is_bettered_by_its_own_settling() -> 
     best, again = found.modes[0], Search(found.drawn.problem)
     settled = again.flipped(again.polished(settle(best.problem, best.state), "settle"))
     assert settled.cost > best.cost - 1.0
+
+
+@pytest.mark.parametrize("bias", [0.01, 0.05])
+def test_right_closures_that_all_contradict_odometry_by_the_same_turn(bias: float) -> None:
+    """A gyroscope's scale is off and nothing else errs: laps of 60 keyframes, closures from each to the next."""
+    count, lap = 300, 60
+    turn = 2 * np.pi / lap
+    closed = np.arange(lap, count, 5)
+    source = np.concatenate((np.arange(count - 1), closed - lap))
+    target = np.concatenate((np.arange(1, count), closed))
+    angle = np.concatenate((np.full(count - 1, turn * (1 + bias)), np.full(len(closed), turn * lap)))
+    measured = Rotation.from_rotvec(np.outer(angle, [0, 0, 1.0])).as_quat()
+    kind = [0] * (count - 1) + [1] * len(closed)
+    solution = solve(ViewGraph.create(source, target, source_from_target=measured, kind=kind))
+    truth = Rotation.from_rotvec(np.outer(turn * np.arange(count), [0, 0, 1.0]))
+    error = np.degrees((Rotation.from_quat(solution.world_from_body.numpy()) * truth.inv()).magnitude())
+    assert error.max() < 0.1
+    assert float(solution.outlier_score.max()) < 0.01

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import softmax
@@ -17,6 +18,7 @@ from rotavg_ros.solver.slam.noise.repeats import KERNELS, Closures, Near, Repeat
 from rotavg_ros.solver.slam.posterior.densities import anyhow, log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
+from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, State
 
 # Grids that replace integrals over rates: the shares of false closures that repeat the turn of their run, of one
 # shortly before, and of any other; and the share of near misses among those that repeat none.
@@ -50,6 +52,31 @@ def _split(rates: np.ndarray, kinds: int) -> tuple[np.ndarray, np.ndarray]:
     others = _grid(kinds)[2:]
     each = rates.reshape(len(_OF_RUN) + 1, *others)
     return each[:-1], each[-1:]
+
+
+class Discrepancies(NamedTuple):
+    """By what C closures differ from what predicts them.
+
+    Attributes:
+        residual: ``(C, 3)`` rad, from source to target.
+        predicted: ``(C,)`` rad², variance of the predictions that residuals are counted from.
+        closure_variance: rad² per component, of good closures.
+    """
+
+    residual: np.ndarray
+    predicted: np.ndarray
+    closure_variance: float
+
+    @classmethod
+    def of(cls, problem: Problem, state: State, residual: np.ndarray) -> Discrepancies:
+        """Those of a labelling, from residuals ``(E, 3)`` of all edges."""
+        closure = problem.closure
+        return cls(residual[closure], state.others.predicted[closure], state.noise.closure_variance)
+
+    @property
+    def least_between_repeats(self) -> float:
+        """Rad, standard deviation of the difference between two closures that share all but their own noise."""
+        return math.sqrt(2 * (1 - max(COMMON_SHARES)) * self.closure_variance)
 
 
 @dataclass(frozen=True)
@@ -194,8 +221,7 @@ def _count_run(product: np.ndarray, total: np.ndarray, products: np.ndarray, tot
 def false_density(
     problem: Problem,
     is_false: np.ndarray,
-    residual: np.ndarray,
-    predicted: np.ndarray,
+    off: Discrepancies,
     rows: np.ndarray,
     both_sides: bool = False,
 ) -> FalseDensity:
@@ -207,13 +233,13 @@ def false_density(
     Args:
         problem: the graph.
         is_false: ``(C,)`` bool, labels of the others.
-        residual: ``(C, 3)`` rad, of the closures, from source to target.
-        predicted: ``(C,)`` rad², variance of the predictions that residuals are counted from.
+        off: of all closures.
         rows: ``(n,)`` closures to evaluate.
         both_sides: given all others, not only those detected before.
     """
     spend(_LOOKED_AT * len(rows))
     k, count = problem.components, len(rows)
+    residual, predicted, _ = off
     square = (residual[rows] ** 2).sum(axis=1)
     near_misses = _near_miss_shares(problem.priors)[:, None]
     alone = np.exp(log_false(square, k, problem.priors, near_misses, predicted[rows]))
@@ -232,7 +258,8 @@ def false_density(
     is_one = is_false[rows] if both_sides else None
     between = places_near(problem.detected[false], problem.detected[rows], is_one)
     closures, near = Closures(older, newer, turn, is_told), Near(rows, false, between)
-    return FalseDensity(alone, repeats(closures, near, problem.priors.run_gap_steps, k), run)
+    repeated = repeats(closures, near, problem.priors.run_gap_steps, k, off.least_between_repeats)
+    return FalseDensity(alone, repeated, run)
 
 
 def _near_miss_shares(priors: SlamPriors) -> np.ndarray:
@@ -272,20 +299,17 @@ def log_false_set(problem: Problem, density: FalseDensity) -> float:
     return float(np.logaddexp.reduce(_log_weighted(problem, density)))
 
 
-def if_false(
-    problem: Problem, is_false: np.ndarray, residual: np.ndarray, predicted: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def if_false(problem: Problem, is_false: np.ndarray, off: Discrepancies) -> tuple[np.ndarray, np.ndarray]:
     """``(C,)`` densities of each closure if it is false: given all other false ones, and independently.
 
     Args:
         problem: the graph.
         is_false: ``(C,)`` bool.
-        residual: ``(C, 3)`` rad, from source to target.
-        predicted: ``(C,)`` rad², variance of the predictions that residuals are counted from.
+        off: of all closures.
     """
     rows = np.flatnonzero(is_false)
-    false = false_density(problem, is_false, residual, predicted, rows)
-    each = false_density(problem, is_false, residual, predicted, np.arange(len(is_false)), both_sides=True)
+    false = false_density(problem, is_false, off, rows)
+    each = false_density(problem, is_false, off, np.arange(len(is_false)), both_sides=True)
     rates = repeat_rates(problem, false)
     own = _own_shares(problem, rows, false.by_shares(rates))
     return each.mean(rates, own), each.alone.mean(axis=0)

@@ -11,7 +11,7 @@ import numpy as np
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.em import settle
-from rotavg_ros.solver.slam.posterior.labels.false_closures import false_density, log_false_set
+from rotavg_ros.solver.slam.posterior.labels.false_closures import Discrepancies, false_density, log_false_set
 from rotavg_ros.solver.slam.posterior.labels.prior import log_label_prior, log_slip_odds
 from rotavg_ros.solver.slam.posterior.left_out import rough_cost
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
@@ -171,9 +171,9 @@ def log_labelled(mode: Mode, is_false: np.ndarray, residual: np.ndarray | None =
         residual: ``(C, 3)`` rad, from source to target; default: those of ``mode``.
     """
     problem = mode.problem
-    residual = mode.evaluation.residual[problem.closure] if residual is None else residual
-    predicted = mode.state.others.predicted[problem.closure]
-    density = false_density(problem, is_false, residual, predicted, np.flatnonzero(is_false))
+    off = Discrepancies.of(problem, mode.state, mode.evaluation.residual)
+    off = off if residual is None else off._replace(residual=residual)
+    density = false_density(problem, is_false, off, np.flatnonzero(is_false))
     return log_false_set(problem, density) + log_label_prior(problem, is_false)
 
 
