@@ -105,10 +105,9 @@ def solve(
     run = Run(Networks(where, weights), Stopwatch(), refinement_steps, warm_start, goes_on_from, work, anew)
     with metered() as meter:
         estimate, run = _run_where_it_can(job, run)
-    score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, estimate.outlier_score.cpu())
-    score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
     places = estimate.places
-    rotation_score = None if places is None else places.rotation_score
+    score = _as_labelled(graph, estimate.outlier_score.cpu())
+    rotation_score = None if places is None else _as_labelled(graph, places.rotation_score)
     return Solution(
         _root_at_identity(estimate.body_from_world.cpu(), job.component),
         score,
@@ -272,6 +271,12 @@ def _solve_baseline(job: _Job, name: str, run: Run) -> Estimate:
         orientations = baselines.BASELINES[name](graph, run.warm_start)
     score = baselines.residual_score(graph, orientations, _OUTLIER_ANGLE[job.profile])
     return Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))
+
+
+def _as_labelled(graph: ViewGraph, score: Tensor) -> Tensor:
+    """Scores ``(M,)``; 0 for edges that a user has accepted, 1 for rejected ones."""
+    score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, score)
+    return torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
 
 
 def _root_at_origin(position: Tensor, body_from_world: Tensor, component: Tensor) -> Tensor:

@@ -34,7 +34,8 @@ class Solution:
         position_uncertainty: ``(N,)`` metres, standard deviation of each component; None likewise.
         rotation_score: ``(M,)`` probability that the edge's rotation alone errs by more than 10°; None likewise.
         edge_precision: ``(M, 2)`` rad⁻² and m⁻² per component, weights of the edges in the answer, 0 where a
-            translation is unknown and for closures that are made of odometry; None likewise.
+            translation is unknown and for closures that are made of odometry; copies of a measurement share its
+            weight; None likewise.
         warnings: reasons not to trust the answer, one sentence each: what was seen, a possible cause, what to do.
         step_deviation: radians, standard deviation of each component of a step of odometry; NaN where the method does
             not estimate it.

@@ -44,7 +44,9 @@ def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     estimate = _solve_once(without_repeats(graph, *repeats), stages, run)
     places = estimate.places
     if places is not None:
-        places = replace(places, rotation_score=places.rotation_score[says_as], precision=places.precision[says_as])
+        # Least squares on all copies counts the measurement once, as the solve does.
+        precision = places.precision[says_as] / torch.bincount(says_as)[says_as, None]
+        places = replace(places, rotation_score=places.rotation_score[says_as], precision=precision)
     restated = estimate.restated
     if restated is not None:
         restated = torch.isin(says_as, restated).nonzero()[:, 0]

@@ -151,7 +151,10 @@ def _precision(pose: PoseMode) -> np.ndarray:
     shift = noise.of_odometry(problem.travelled) + slipped * drawn.share_of_segment * slip
     if problem.jump is not None:
         shift += problem.jump
-    shift[drawn.view_graph_edge[problem.beside - drawn.num_segments]] *= noise.beside
+    # As the rows have it: beside the chain, what is rejected or slipped does not pull.
+    beside = np.flatnonzero(drawn.is_beside)
+    used = np.trace(pose.solved.covariance[beside], axis1=1, axis2=2) / problem.shifts
+    shift[drawn.view_graph_edge[beside - drawn.num_segments]] = used
     turn[edges] = mean_square[closure] / pose.solved.rotation_weight[closure, 0]
     shift[drawn.restated.edge] = np.inf
     back = pose.solved.closure_back
