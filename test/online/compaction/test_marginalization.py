@@ -149,10 +149,12 @@ def test_the_solver_says_the_same_of_those_that_are_left(method, relative, score
     np.testing.assert_allclose(small.outlier_score, together, atol=score)
 
 
-def contracted(graph: ViewGraph) -> tuple[ViewGraph, np.ndarray]:
-    """Without the keyframes that no closure touches; and which are left."""
+def contracted(graph: ViewGraph, but_every: int = 0) -> tuple[ViewGraph, np.ndarray]:
+    """Without the keyframes that no closure touches, but every so-and-so-many-th; and which are left."""
     edges = columns_of(graph)
     remove = can_be_marginalized(graph.num_nodes, edges)
+    if but_every:
+        remove[::but_every] = False
     done = marginalize(keyframes_of(graph.num_nodes), edges, NO_ROUTES, remove, MarginalizedKeyframes.none())
     left = ViewGraph.create(
         **{name: done.edges[name] for name in COLUMNS}, translation=done.edges["translation"], num_nodes=len(done.kept)
@@ -182,6 +184,19 @@ def test_nor_does_it_of_odometry_that_errs_in_turns_or_whose_translations_count(
     turned = Rotation.from_quat(small.body_from_world) * Rotation.from_quat(full.body_from_world[kept]).inv()
     assert (turned.magnitude()[1:] / full.uncertainty[kept].numpy()[1:]).max() < sigmas
     np.testing.assert_allclose(small.uncertainty[1:], full.uncertainty[kept][1:], rtol=0.05)
+
+
+def test_keyframes_between_contracted_steps_are_as_uncertain():
+    """In orientation and place: of a contracted step the lag and the spread tell how it bends what follows."""
+    graph = next(drawings(stress.kinds(("building: closures of 6°",), translations=True), [3])).graph
+    closures = np.flatnonzero(~graph.is_odometry.numpy())
+    graph = graph.select_edges(torch.from_numpy(np.setdiff1d(np.arange(graph.num_edges), closures[5:])))
+    left, kept = contracted(graph, but_every=20)
+    assert graph.num_nodes - len(kept) > 150
+    method = "neurora~fine-net,turns,tails,bias"
+    full, small = solve(graph, method=method), solve(left, method=method)
+    np.testing.assert_allclose(small.uncertainty[1:], full.uncertainty[kept][1:], rtol=0.01)
+    np.testing.assert_allclose(small.position_uncertainty[1:], full.position_uncertainty[kept][1:], rtol=0.02)
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

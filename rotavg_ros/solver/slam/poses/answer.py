@@ -11,8 +11,9 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
 from rotavg_ros.solver.slam.poses.closures import GOOD, Predictions
+from rotavg_ros.solver.slam.poses.inner_nodes import InnerNodes, NodePoses, poses_of_nodes
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
-from rotavg_ros.solver.slam.poses.row_errors import bridge_variance, closure_turns, mean_over_axes, mean_turn
+from rotavg_ros.solver.slam.poses.row_errors import closure_turns, mean_over_axes, mean_turn
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.publishing.modes import FAR_TURN, LIKELY, median, warning_of_rivals
 from rotavg_ros.solver.slam.stages import outlier_scores
@@ -111,29 +112,24 @@ def _warnings(
 
 def _of_mode(pose: PoseMode) -> Poses:
     """One labelling's answer."""
-    problem, drawn, k = pose.problem, pose.problem.drawn, pose.problem.turns
-    orientation, position, passed = _within_segments(pose)
-    of_nodes = pose.solved.factor.variance[: drawn.num_nodes]
-    own, shifts = of_nodes[:, :k].mean(axis=1), of_nodes[:, k:].mean(axis=1)
-    apart = np.trace(_apart(pose)[:, :k, :k], axis1=1, axis2=2) / k
-    variance = drawn.variance(own, apart, mean_turn(problem, pose.state.noise))
-    between = (1 - passed) * shifts[drawn.above] + passed * shifts[drawn.below]
-    segment = problem.segment_of_node
-    spread = pose.state.noise.of_odometry(pose.solved.way.travelled[: drawn.num_segments]) + problem.jumps
-    between += passed * (1 - passed) * np.where(segment >= 0, spread[np.maximum(segment, 0)], 0.0)
-    of_restated = _scores_of_restated(pose, orientation, position)
+    problem, drawn = pose.problem, pose.problem.drawn
+    nodes = poses_of_nodes(pose)
+    variance, position_variance = _variances(pose, nodes)
+    of_restated = _scores_of_restated(pose, nodes.body_from_world, nodes.position)
     score, rotation = (outlier_scores(drawn, *each) for each in zip(_scores(pose), of_restated, strict=True))
     if problem.jump is not None:
         score = np.maximum(score, problem.jump > 0)
-    return Poses(orientation, position, variance, between, score, rotation, _precision(pose))
+    told = variance, position_variance, score, rotation, _precision(pose)
+    return Poses(nodes.body_from_world, nodes.position, *told)
 
 
-def _apart(pose: PoseMode) -> np.ndarray:
-    """``(S, d, d)`` covariance of the difference between each segment's ends."""
-    segments, d = pose.problem.drawn.num_segments, pose.problem.turns + pose.problem.shifts
-    difference = np.concatenate((np.eye(d), -np.eye(d), np.zeros((d, d))), axis=1)
-    rows = np.tile(difference, (segments, 1, 1))
-    return pose.solved.factor.covariance(rows, np.arange(segments))
+def _variances(pose: PoseMode, nodes: NodePoses) -> tuple[np.ndarray, np.ndarray]:
+    """``(N,)`` rad² and m² per component, of orientations and positions."""
+    drawn, k = pose.problem.drawn, pose.problem.turns
+    of_nodes = pose.solved.factor.variance[: drawn.num_nodes][drawn.above]
+    inner = InnerNodes.of(pose, nodes)
+    of_nodes[inner.node] = np.diagonal(inner.covariance(pose), axis1=1, axis2=2)
+    return of_nodes[:, :k].mean(axis=1), of_nodes[:, k:].mean(axis=1)
 
 
 def _precision(pose: PoseMode) -> np.ndarray:
@@ -161,41 +157,6 @@ def _precision(pose: PoseMode) -> np.ndarray:
     shift[edges] = np.einsum("cij,cij->c", back, back) / problem.shifts
     known = np.isfinite(problem.translation).all(axis=1)
     return np.asarray(np.stack((1 / turn, known / shift), axis=1))
-
-
-def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``(N, 4)`` and ``(N, 3)`` poses of all nodes, and each node's share of its segment's variance so far, ``(N,)``.
-
-    The residual of a segment's shift bends the segment: for a Brownian bridge b with z = −∫ d × dε,
-    E[b | z] = Σ (G × Cov(z)⁻¹ z), with Σ of a step and G the lever up to the node. The rest of the residual is
-    distributed by distance travelled.
-    """
-    problem, state, drawn = pose.problem, pose.state, pose.problem.drawn
-    segments, shifts = slice(drawn.num_segments), problem.bases[1]
-    orientation = problem.orientations(state)
-    inner = np.flatnonzero(problem.segment_of_node >= 0)
-    segment = problem.segment_of_node[inner]
-    way = problem.displacements(orientation)
-    ends = state.position[drawn.target[segments]] - state.position[drawn.source[segments]]
-    off = (way.displacement[segments] - ends) @ shifts
-    pulled = np.linalg.solve(pose.solved.covariance[segments], off[:, :, None])[:, :, 0] @ shifts.T
-    bent = np.zeros((3, drawn.paths.forest.parent.shape[0]))
-    lever = np.cross(way.lever[inner], pulled[segment]) @ problem.bases[0]
-    about = lever @ problem.about_drift_axis
-    of_about, of_others = bridge_variance(problem, state.noise)[:, segment, None]
-    bent[:, inner] = ((of_about * about + of_others * (lever - about)) @ problem.bases[0].T).T
-    turned = quaternion_rows.multiply(np.ascontiguousarray(orientation.T), quaternion_rows.exp(bent))
-    orientation = np.ascontiguousarray(quaternion_rows.normalize(turned).T)
-    way = problem.displacements(orientation)
-    position = state.position[drawn.above] + way.way
-    passed = np.zeros(len(position))
-    behind, whole = (state.noise.of_odometry(each) for each in (way.passed[inner], way.travelled[segment]))
-    if problem.jump is not None:
-        behind += problem.drawn_steps.up_to_nodes(problem.jump)[inner]
-        whole += problem.jumps[segment]
-    passed[inner] = behind / np.maximum(whole, np.finfo(np.float64).tiny)
-    position[inner] += passed[inner, None] * (ends - way.displacement[segments])[segment]
-    return orientation, position, passed
 
 
 def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:

@@ -178,19 +178,37 @@ class DrawnSteps:
         count = self._num_segments + len(outside)
         at_source, at_target, bridge = np.empty((count, 3)), np.zeros((count, 3)), np.zeros((count, 3, 3))
         lever, way = np.zeros((self._num_nodes, 3)), np.zeros((self._num_nodes, 3))
-        world = turned_back(body_from_world, *self._measured)
-        lag, spread = np.empty((0, 3)), np.empty((0, 3, 3))
-        if self._several is not None:
-            lag, spread = np.zeros((len(world), 3)), np.zeros((len(world), 3, 3))
-            where = self._where_several
-            lag[where], spread[where], bent = self._several.at(body_from_world)
-            world[where] += np.where(self._is_forward[where, None], bent, -bent)
+        world, lag, spread = self._in_world(body_from_world)
         _walk(world, lag, spread, self._steps, (at_source, at_target, bridge), (lever, way))
         at_source[self._num_segments :] = np.where(self._outside_is_forward, outside, 0.0)
         at_target[self._num_segments :] = np.where(self._outside_is_forward, 0.0, outside)
         return Displacements(
             at_source + at_target, at_source, at_target, bridge, self._travelled, lever, self._passed, way
         )
+
+    def squares(self, body_from_world: np.ndarray, way: Displacements) -> np.ndarray:
+        """``(N, 3, 3)`` m², ∫ d dᵀ dq from the preceding key node up to each node, at orientations ``(N, 4)``."""
+        world, lag, spread = self._in_world(body_from_world)
+        passed = self._so_far(world)
+        left = way.at_source[self._segment] - np.where(self._is_forward[:, None], passed, passed - world)
+        if len(lag):
+            left += lag
+        square = left[:, :, None] * left[:, None, :]
+        if len(spread):
+            square += spread
+        weighed = self._steps.variance[:, None] * square.reshape(-1, 9)
+        return self._at_nodes(self._so_far(weighed)).reshape(-1, 3, 3)
+
+    def _in_world(self, body_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """``(P, 3)`` metres, the steps at orientations ``(N, 4)``; lags and spreads of contracted ones, or nothing."""
+        world = turned_back(body_from_world, *self._measured)
+        if self._several is None:
+            return world, np.empty((0, 3)), np.empty((0, 3, 3))
+        lag, spread = np.zeros((len(world), 3)), np.zeros((len(world), 3, 3))
+        where = self._where_several
+        lag[where], spread[where], bent = self._several.at(body_from_world)
+        world[where] += np.where(self._is_forward[where, None], bent, -bent)
+        return world, lag, spread
 
     def up_to_nodes(self, of_edge: np.ndarray) -> np.ndarray:
         """``(N,)`` sums of values ``(M,)`` of odometry's edges from the preceding key node."""

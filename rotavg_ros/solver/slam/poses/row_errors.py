@@ -119,6 +119,12 @@ def mean_closure_shift(problem: PoseProblem, shape: np.ndarray) -> float:
     return float(np.trace(axes.T @ shape @ axes)) / problem.shifts
 
 
+def segment_spread(problem: PoseProblem, noise: PoseNoise, way: Displacements) -> np.ndarray:
+    """``(S,)`` m² per component, of segments' shifts apart from what bends them: by the way, of slips and of jumps."""
+    slip = np.where(problem.slipped, (problem.priors.slip * problem.typical) ** 2, 0.0)
+    return np.asarray(noise.of_odometry(way.travelled[: problem.drawn.num_segments]) + slip + problem.jumps)
+
+
 def shift_covariance(problem: PoseProblem, state: PoseState, way: Displacements) -> np.ndarray:
     """``(E, m, m)`` m², covariance of odometry's shifts; for closures, the unshared part as good ones."""
     drawn, num_segments = problem.drawn, problem.drawn.num_segments
@@ -127,7 +133,7 @@ def shift_covariance(problem: PoseProblem, state: PoseState, way: Displacements)
     variance = noise.of_odometry(way.travelled)
     slipped = drawn.is_odometry & ~problem.mode.state.is_good
     variance += np.where(slipped, (problem.priors.slip * problem.typical) ** 2, 0.0)
-    variance[:num_segments] += problem.jumps
+    variance[:num_segments] = segment_spread(problem, noise, way)
     # Odometry beside the chain that is rejected, or states no translation, connects nothing else, so it does not pull.
     pulled = variance[problem.beside]
     variance[num_segments:] /= NOTHING
@@ -144,10 +150,20 @@ def bent(problem: PoseProblem, way: Displacements) -> np.ndarray:
 
     Turns about n alone contribute ∫ (d × n) (d × n)ᵀ dq to ∫ (‖d‖² I − d dᵀ) dq.
     """
-    shifts, bridge = problem.bases[1], way.bridge[: problem.drawn.num_segments]
-    about = bridge
+    bridge = way.bridge[: problem.drawn.num_segments]
+    return bent_by(problem, np.trace(bridge, axis1=1, axis2=2)[:, None, None] / 2 * np.eye(3) - bridge, bridge)
+
+
+def bent_by(problem: PoseProblem, square: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """``(2, n, m, m)`` m² per rad² a step, as :func:`bent`.
+
+    Args:
+        problem: the graph.
+        square: ``(n, 3, 3)`` ∫ d d'ᵀ dq.
+        whole: ``(n, 3, 3)`` ∫ (d · d' I − d' dᵀ) dq.
+    """
+    shifts, about = problem.bases[1], whole
     if problem.drift_axis is not None:
-        second = np.trace(bridge, axis1=1, axis2=2)[:, None, None] / 2 * np.eye(3) - bridge
         crossed = np.cross(np.eye(3), problem.drift_axis)
-        about = crossed.T @ second @ crossed
-    return np.asarray(shifts.T @ np.stack((about, bridge - about)) @ shifts)
+        about = crossed.T @ square @ crossed
+    return np.asarray(shifts.T @ np.stack((about, whole - about)) @ shifts)

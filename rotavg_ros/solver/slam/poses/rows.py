@@ -43,14 +43,14 @@ def jacobian(problem: PoseProblem, way: Displacements) -> np.ndarray:
     edges, unit = rows[:num_edges], np.eye(d)
     edges[:, :, :d], edges[:, :, d : 2 * d] = unit, -unit
     edges[:, :k, :k], edges[:, :k, d : d + k] = problem.even_turns.even, -problem.even_turns.even
-    edges[:, k:, :k] = -_crossed(problem, way.at_target)
-    edges[:, k:, d : d + k] = -_crossed(problem, way.at_source)
+    edges[:, k:, :k] = -crossed(problem, way.at_target)
+    edges[:, k:, d : d + k] = -crossed(problem, way.at_source)
     edges[:, :, 2 * d :] = problem.sign[:, None, None] * unit
     rows[num_edges:, :, :d] = unit
     return rows
 
 
-def _crossed(problem: PoseProblem, vector: np.ndarray) -> np.ndarray:
+def crossed(problem: PoseProblem, vector: np.ndarray) -> np.ndarray:
     """``(E, m, k)`` matrices of v × in the bases."""
     return np.asarray((vector @ crossing(*problem.bases)).reshape(len(vector), problem.shifts, problem.turns))
 
