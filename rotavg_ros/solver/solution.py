@@ -31,7 +31,7 @@ class Solution:
             none.
         position: ``(N, 3)`` float64 metres, each component's first node at the origin, in the frame of its orientation;
             None where translations are unknown or were not used.
-        position_uncertainty: ``(N,)`` metres, standard deviation of each component; None likewise.
+        position_uncertainty: ``(N,)`` metres, standard deviation of each component in that frame; None likewise.
         rotation_score: ``(M,)`` probability that the edge's rotation alone errs by more than 10°; None likewise.
         edge_precision: ``(M, 2)`` rad⁻² and m⁻² per component, weights of the edges in the answer, 0 where a
             translation is unknown and for closures that are made of odometry; copies of a measurement share its

@@ -60,6 +60,20 @@ def test_nor_do_they_with_translations(kind: str) -> None:
     torch.testing.assert_close(found.outlier_score, expected.outlier_score, atol=0.01, rtol=0)
 
 
+@pytest.mark.parametrize("kind", ["building: 30 % random", "hills: gyroscope bias, 30 % random"])
+def test_uncertainty_is_that_of_turns_since_the_first_keyframe(kind: str) -> None:
+    """Which is none of itself; between two keyframes it is the same, whichever of both is the first."""
+    graph = drawn(kind, 3).graph
+    middle, number = graph.num_nodes // 2, torch.arange(graph.num_nodes)
+    number[[0, middle]] = number[[middle, 0]]
+    changed = replace(graph, source=number[graph.source], target=number[graph.target])
+    # The one answer, since rivals' shares and the variances of each differ a little.
+    expected, found = (solve(each, profile="slam", method="neurora~rivals").uncertainty for each in (graph, changed))
+    assert found[0] < 1e-5 and expected[0] < 1e-4
+    torch.testing.assert_close(found[middle], expected[middle], rtol=0.02, atol=0)
+    assert found.median() < 0.9 * expected.median()
+
+
 def largest_turn_deg(one: torch.Tensor, other: torch.Tensor) -> float:
     """Between orientations ``(N, 4)`` of one component whose gauges may differ, those of its first keyframe held."""
     turns = [rotations.multiply(each, rotations.inverse(each[:1]).expand_as(each)) for each in (one, other)]

@@ -143,11 +143,32 @@ class ClosureGraph:
         return torch.from_numpy(quaternion_rows.spread(odometry, correction.numpy(), self._between, self.fraction))
 
     @property
+    def first(self) -> np.ndarray:
+        """``(N,)`` the view-graph's node that each one is stated relative to: the first of its component."""
+        component = self.paths.forest.component
+        return np.asarray(np.unique(component, return_index=True)[1][component])
+
+    @property
+    def is_held_at_first(self) -> bool:
+        """Whether each component's root, an end of odometry, is its first node."""
+        return np.array_equal(np.unique(self.first), np.sort(self.nodes[self.roots]))
+
+    @property
+    def first_column(self) -> np.ndarray:
+        """``(K, 1)`` first nodes by key nodes, all components in one column, since they share no unknowns."""
+        first, column = np.unique(self.first), np.zeros((self.num_nodes, 1))
+        np.add.at(column[:, 0], self.above[first], 1 - self.fraction[first])
+        np.add.at(column[:, 0], self.below[first], self.fraction[first])
+        return column
+
+    @property
     def _between(self) -> np.ndarray:
         """``(N, 2)`` key nodes above and below."""
         return np.stack((self.above, self.below), axis=1)
 
-    def variance(self, own: np.ndarray, apart: np.ndarray, step_variance: float) -> np.ndarray:
+    def variance(
+        self, own: np.ndarray, apart: np.ndarray, step_variance: float, with_first: np.ndarray | None = None
+    ) -> np.ndarray:
         """Variance of all nodes ``(N,)``, rad².
 
         Inside a segment the error is interpolated between the ends, plus a Brownian bridge.
@@ -156,12 +177,24 @@ class ClosureGraph:
             own: ``(K,)`` rad², variances of the key nodes.
             apart: ``(S,)`` rad², variance of the difference between both ends of each segment.
             step_variance: rad², variance of one step of odometry.
+            with_first: ``(K,)`` rad², H⁻¹ :attr:`first_column`, for variances relative to the first nodes; None:
+                relative to the roots.
         """
         across = np.zeros(self.num_nodes)
         across[self.target[: self.num_segments]] = apart
         rest = self.fraction * (1 - self.fraction)
-        of_ends = (1 - self.fraction) * own[self.above] + self.fraction * own[self.below]
-        return np.asarray(of_ends + rest * (self.length * step_variance - across[self.below]))
+        variance = self.interpolated(own) + rest * (self.length * step_variance - across[self.below])
+        if with_first is None:
+            return np.asarray(variance)
+        first = self.first
+        inside = (self.above == self.above[first]) & (self.below == self.below[first])
+        bridge = np.minimum(self.fraction, self.fraction[first]) - self.fraction * self.fraction[first]
+        common = self.interpolated(with_first) + inside * bridge * self.length * step_variance
+        return np.asarray(np.maximum(variance + variance[first] - 2 * common, 0.0))
+
+    def interpolated(self, value: np.ndarray) -> np.ndarray:
+        """``(N,)`` of values ``(K,)`` of the key nodes."""
+        return np.asarray((1 - self.fraction) * value[self.above] + self.fraction * value[self.below])
 
     def corrections(self, body_from_world: Tensor) -> Tensor:
         """Orientations of all nodes ``(N, 4)`` → corrections of the key nodes ``(K, 4)``."""
@@ -177,6 +210,16 @@ class ClosureGraph:
         root[component[self.roots]] = self.roots
         back = rotations.inverse(correction[torch.from_numpy(root[component])])
         return rotations.normalize(rotations.multiply(correction, back))
+
+    def from_first(self, correction: np.ndarray) -> np.ndarray:
+        """Corrections ``(4, K)`` in the gauge in which those of the first nodes are the identity."""
+        if self.is_held_at_first:
+            return correction
+        first = self.first[self.nodes]
+        own = np.tile([0.0, 0.0, 0.0, 1.0], (len(first), 1)), np.ascontiguousarray(correction.T)
+        of_first = quaternion_rows.spread(*own, self._between[first], self.fraction[first])
+        back = quaternion_rows.inverse(np.ascontiguousarray(of_first.T))
+        return np.asarray(quaternion_rows.normalize(quaternion_rows.multiply(correction, back)))
 
     def edge_values(self, value: np.ndarray, restated: np.ndarray | float) -> np.ndarray:
         """Values of this graph's edges ``(E,)`` → values of the view-graph's edges ``(M,)``.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,10 +11,11 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
 from rotavg_ros.solver.slam.poses.closures import GOOD, Predictions
-from rotavg_ros.solver.slam.poses.inner_nodes import InnerNodes, NodePoses, poses_of_nodes
+from rotavg_ros.solver.slam.poses.inner_nodes import poses_of_nodes
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.row_errors import closure_turns, mean_over_axes, mean_turn
 from rotavg_ros.solver.slam.poses.solved import PoseMode
+from rotavg_ros.solver.slam.poses.uncertainty import variances
 from rotavg_ros.solver.slam.posterior.publishing.modes import FAR_TURN, LIKELY, median, warning_of_rivals
 from rotavg_ros.solver.slam.stages import outlier_scores
 from rotavg_ros.view_graph import FALSE_CLOSURE_M
@@ -32,8 +33,8 @@ class Poses:
     Attributes:
         body_from_world: ``(N, 4)`` xyzw.
         position: ``(N, 3)`` metres, in the frame of the odometry's orientations; roots at the origin.
-        variance: ``(N,)`` rad² per component, of orientations.
-        position_variance: ``(N,)`` m² per component.
+        variance: ``(N,)`` rad² per component, of orientations relative to the component's first node.
+        position_variance: ``(N,)`` m² per component, in that node's frame.
         outlier_probability: ``(M,)`` that a closure is false, in rotation or place; that odometry's position jumped.
         rotation_probability: ``(M,)`` that a closure's rotation is false; that odometry slipped.
         precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count; 0 for unknown translations.
@@ -58,11 +59,12 @@ def answer(rivals: list[PoseMode], share: np.ndarray) -> tuple[Poses, int]:
         share: their probabilities.
     """
     single = [_of_mode(pose) for pose in rivals]
-    orientations = [np.ascontiguousarray(other.body_from_world.T) for other in single]
+    seen = [_seen_from(rivals[0].problem.drawn.first, each) for each in single]
+    orientations = [np.ascontiguousarray(other.body_from_world.T) for other in seen]
     middle = median(orientations, share)
     chosen, base = single[middle], quaternion_rows.inverse(orientations[middle])
     turns = np.array([quaternion_rows.log(quaternion_rows.multiply(base, other)) for other in orientations])
-    shifts = np.array([other.position - chosen.position for other in single])
+    shifts = np.array([other.position - seen[middle].position for other in seen])
     k, m = rivals[0].problem.turns, rivals[0].problem.shifts
 
     def mixed(name: str) -> np.ndarray:
@@ -76,9 +78,17 @@ def answer(rivals: list[PoseMode], share: np.ndarray) -> tuple[Poses, int]:
         np.clip(mixed("outlier_probability"), 0.0, 1.0),
         np.clip(mixed("rotation_probability"), 0.0, 1.0),
         mixed("precision"),
-        _warnings(rivals[middle].problem.graph.is_odometry.numpy(), single, chosen, share, turns),
+        _warnings(rivals[middle].problem.graph.is_odometry.numpy(), seen, seen[middle], share, turns),
     )
     return poses, middle
+
+
+def _seen_from(first: np.ndarray, poses: Poses) -> Poses:
+    """Poses in the frame of each node's first one ``(N,)``, as they are stated in the end."""
+    frame = torch.from_numpy(poses.body_from_world[first])
+    orientation = rotations.multiply(torch.from_numpy(poses.body_from_world), rotations.inverse(frame))
+    position = rotations.rotate(frame, torch.from_numpy(poses.position - poses.position[first]))
+    return replace(poses, body_from_world=rotations.normalize(orientation).numpy(), position=position.numpy())
 
 
 def _warnings(
@@ -88,7 +98,7 @@ def _warnings(
 
     Args:
         is_odometry: ``(M,)`` bool.
-        rivals, chosen: each one's answer, and that which is published.
+        rivals, chosen: each one's answer, and that which is published, seen from the first nodes.
         share: their probabilities.
         turns: ``(R, 3, N)`` rad, by which each rival's orientations differ from the published ones.
     """
@@ -114,22 +124,12 @@ def _of_mode(pose: PoseMode) -> Poses:
     """One labelling's answer."""
     problem, drawn = pose.problem, pose.problem.drawn
     nodes = poses_of_nodes(pose)
-    variance, position_variance = _variances(pose, nodes)
     of_restated = _scores_of_restated(pose, nodes.body_from_world, nodes.position)
     score, rotation = (outlier_scores(drawn, *each) for each in zip(_scores(pose), of_restated, strict=True))
     if problem.jump is not None:
         score = np.maximum(score, problem.jump > 0)
-    told = variance, position_variance, score, rotation, _precision(pose)
+    told = *variances(pose, nodes), score, rotation, _precision(pose)
     return Poses(nodes.body_from_world, nodes.position, *told)
-
-
-def _variances(pose: PoseMode, nodes: NodePoses) -> tuple[np.ndarray, np.ndarray]:
-    """``(N,)`` rad² and m² per component, of orientations and positions."""
-    drawn, k = pose.problem.drawn, pose.problem.turns
-    of_nodes = pose.solved.factor.variance[: drawn.num_nodes][drawn.above]
-    inner = InnerNodes.of(pose, nodes)
-    of_nodes[inner.node] = np.diagonal(inner.covariance(pose), axis1=1, axis2=2)
-    return of_nodes[:, :k].mean(axis=1), of_nodes[:, k:].mean(axis=1)
 
 
 def _precision(pose: PoseMode) -> np.ndarray:

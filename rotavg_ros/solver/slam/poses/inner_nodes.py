@@ -103,12 +103,16 @@ class InnerNodes:
 
     Attributes:
         node, segment: ``(n,)``.
+        points: where in these they lie.
+        gain: ``(n, d, m)`` G.
         jacobian: ``(n, d, 3 d)`` how turns and positions depend on the blocks of their segment's row.
         left: ``(n, d, d)`` their covariance if the key nodes are given.
     """
 
     node: np.ndarray
     segment: np.ndarray
+    points: _Points
+    gain: np.ndarray
     jacobian: np.ndarray
     left: np.ndarray
 
@@ -123,7 +127,15 @@ class InnerNodes:
         told = _covariance(pose, nodes.way, segment, here, end)[:, :, -m:]
         gain = np.linalg.solve(of_shift, told.transpose(0, 2, 1)).transpose(0, 2, 1)
         left = _covariance(pose, nodes.way, segment, here, here) - gain @ told.transpose(0, 2, 1)
-        return cls(node, segment, _from_ends(problem, nodes.way, (node, segment, here), gain), left)
+        return cls(node, segment, here, gain, _from_ends(problem, nodes.way, (node, segment, here), gain), left)
+
+    def left_with(self, pose: PoseMode, way: Displacements, some: np.ndarray, others: np.ndarray) -> np.ndarray:
+        """``(q, d, d)`` as :attr:`left`, of some ``(q,)`` of the n nodes with others ``(q,)`` of the same segments."""
+        segment = self.segment[some]
+        of_shift = pose.solved.covariance[segment]
+        one, other = (_Points(*(value[each] for value in self.points)) for each in (some, others))
+        prior = _covariance(pose, way, segment, one, other)
+        return np.asarray(prior - self.gain[some] @ of_shift @ self.gain[others].transpose(0, 2, 1))
 
     def covariance(self, pose: PoseMode) -> np.ndarray:
         """``(n, d, d)`` of their turns and positions."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import networkx
 import numpy as np
 import pytest
@@ -14,7 +16,8 @@ from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.solver.algebra.spanning_forest import minimum_spanning_forest
 from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract
-from rotavg_ros.solver.slam.graph.odometry_paths import Growth, OdometryPaths
+from rotavg_ros.solver.slam.graph.odometry_paths import Growth, OdometryPaths, odometry_forest
+from rotavg_ros.solver.slam.posterior.system import NormalEquations
 from test.solver.graphs import measured, random_truth, slam_edges, small_noise
 
 
@@ -131,6 +134,41 @@ def test_corrections_counted_from_roots_say_the_same() -> None:
         for each in (correction, counted)
     )
     torch.testing.assert_close(after, before, atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_variances_are_relative_to_the_first_node_wherever_it_lies(seed: int) -> None:
+    """Resistances between it and each node of the whole graph, by the pseudo-inverse of its Laplacian."""
+    graph, number = _slam_graph(60, 4, seed), torch.from_numpy(np.random.default_rng(seed).permutation(60))
+    graph = replace(graph, source=number[graph.source], target=number[graph.target])
+    contracted = contract(graph, OdometryPaths.along(graph, odometry_forest(graph)))
+    assert not contracted.is_held_at_first
+    ends = torch.stack((graph.source, graph.target)).numpy()
+    rows = np.eye(60)[ends[1]] - np.eye(60)[ends[0]]
+    variance = np.where(graph.is_odometry, 2.0, 5.0)
+    inverse = np.linalg.pinv(rows.T / variance @ rows)
+    expected = np.diagonal(inverse) + inverse[0, 0] - 2 * inverse[0]
+
+    run = np.full(len(contracted.source), -1)
+    ends = contracted.source, contracted.target
+    system = NormalEquations(contracted.num_nodes, *ends, run, np.zeros(len(run)), contracted.roots)
+    solved = system.factorise(1 / (contracted.own_steps * np.where(contracted.is_odometry, 2.0, 5.0)))
+    apart = solved.resistance[: contracted.num_segments]
+    found = contracted.variance(solved.variance, apart, 2.0, solved.solve(contracted.first_column)[:, 0])
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
+
+
+def test_corrections_counted_from_a_first_node_inside_a_segment_say_the_same() -> None:
+    graph, number = _slam_graph(60, 4, 0), torch.from_numpy(np.random.default_rng(0).permutation(60))
+    graph = replace(graph, source=number[graph.source], target=number[graph.target])
+    contracted = contract(graph, OdometryPaths.along(graph, odometry_forest(graph)))
+    assert 0 not in contracted.nodes
+    correction = rotations.random(contracted.num_nodes, generator=torch.Generator().manual_seed(0)).numpy()
+    counted = np.ascontiguousarray(contracted.from_first(np.ascontiguousarray(correction.T)).T)
+    before, after = (contracted.orientations(torch.from_numpy(each)) for each in (correction, counted))
+    relative = [rotations.multiply(each, rotations.inverse(each[:1]).expand_as(each)) for each in (before, after)]
+    assert float(rotations.angle_between(*relative).max()) < 1e-7
+    assert float(rotations.angle_between(after[:1], contracted.odometry_orientation[:1]).max()) < 1e-7
 
 
 def test_graphs_without_closures_or_without_odometry() -> None:

@@ -87,8 +87,8 @@ def odometry_with_two_closures(kind: str, backward: bool) -> ViewGraph:
     return graph.select_edges(kept)
 
 
-def told_to_gtsam(graph: ViewGraph, mode: PoseMode, found: Poses) -> tuple[object, object]:
-    """The whole graph with the noise of an answer, as gtsam's factors, and its poses, from which to start."""
+def told_to_gtsam(graph: ViewGraph, mode: PoseMode, found: Poses, held: int = 0) -> tuple[object, object]:
+    """The whole graph with the noise of an answer, as gtsam's factors, one node held, and its poses to start from."""
     gtsam = pytest.importorskip("gtsam")
     problem, solved = mode.problem, mode.solved
     odometry, closures = graph.is_odometry.numpy(), mode.problem.mode.problem.closure
@@ -123,8 +123,17 @@ def told_to_gtsam(graph: ViewGraph, mode: PoseMode, found: Poses) -> tuple[objec
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
         measured = gtsam.Pose3(gtsam.Rot3(turn[edge]), translation[edge])
         factors.add(gtsam.BetweenFactorPose3(int(source[edge]), int(target[edge]), measured, noise))
-    factors.add(gtsam.PriorFactorPose3(0, start.atPose3(0), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    factors.add(gtsam.PriorFactorPose3(held, start.atPose3(held), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
     return factors, start
+
+
+def deviations(factors: object, best: object, problem: PoseProblem) -> np.ndarray:
+    """``(2, N)`` gtsam's standard deviations of turns and positions, per component."""
+    gtsam = pytest.importorskip("gtsam")
+    marginals = gtsam.Marginals(factors, best)
+    covariance = [marginals.marginalCovariance(node) for node in range(problem.graph.num_nodes)]
+    square = np.diagonal(np.array(covariance), axis1=1, axis2=2)
+    return np.sqrt([square[:, :3].sum(axis=1) / problem.turns, square[:, 3:].sum(axis=1) / problem.shifts])
 
 
 @pytest.mark.parametrize("backward", [False, True])
@@ -147,15 +156,31 @@ def test_what_is_drawn_together_is_the_whole_graphs_optimum(kind: str, backward:
     drift = np.abs(world_from_body.magnitude()).max()
     assert drift > np.radians(10)
     assert np.degrees(off.max()) < 0.05 and apart.max() < 0.01
-    marginals, problem = gtsam.Marginals(factors, best), mode.problem
-    covariance = np.array([marginals.marginalCovariance(node) for node in range(graph.num_nodes)])
-    square = np.diagonal(covariance, axis1=1, axis2=2)[1:]
-    assert len(problem.drawn.nodes) < 0.1 * graph.num_nodes
-    for ours, theirs, count in (
-        (found.variance, square[:, :3], problem.turns),
-        (found.position_variance, square[:, 3:], problem.shifts),
-    ):
-        np.testing.assert_allclose(np.sqrt(ours[1:]), np.sqrt(theirs.sum(axis=1) / count), rtol=0.02)
+    assert len(mode.problem.drawn.nodes) < 0.1 * graph.num_nodes
+    ours = np.sqrt([found.variance, found.position_variance])
+    np.testing.assert_allclose(ours[:, 1:], deviations(factors, best, mode.problem)[:, 1:], rtol=0.02)
+
+
+@pytest.mark.parametrize("where", ["inside", "at a closure"])
+@pytest.mark.parametrize("kind", ["plane", "hills", "gravity"])
+def test_uncertainty_is_relative_to_the_first_node(kind: str, where: str) -> None:
+    """Whichever keyframe has the lowest number: gtsam's, with that one held."""
+    gtsam = pytest.importorskip("gtsam")
+    graph = odometry_with_two_closures(kind, backward=False)
+    first = int(graph.target[~graph.is_odometry][-1]) if where == "at a closure" else 70
+    number = torch.arange(graph.num_nodes)
+    number[[0, first]] = number[[first, 0]]
+    mode = pose_mode(replace(graph, source=number[graph.source], target=number[graph.target]), ("turns", "tails"))
+    assert (number[first] in mode.problem.drawn.nodes) == (where == "at a closure")
+    by_number, _ = answer([mode], np.ones(1))
+    names = ("body_from_world", "position", "variance", "position_variance")
+    found = replace(by_number, **{name: getattr(by_number, name)[number.numpy()] for name in names})
+    factors, start = told_to_gtsam(graph, mode, found, first)
+    best = gtsam.LevenbergMarquardtOptimizer(factors, start).optimize()
+    ours, theirs = np.sqrt([found.variance, found.position_variance]), deviations(factors, best, mode.problem)
+    assert (ours[:, first] < 1e-6).all()
+    others = np.arange(graph.num_nodes) != first
+    np.testing.assert_allclose(ours[:, others], theirs[:, others], rtol=0.02)
 
 
 @pytest.mark.large

@@ -34,12 +34,14 @@ class Held:
         variance: ``(K,)`` variances of these.
         apart: ``(S,)`` variances of the difference between the two ends of each segment.
         factor: ``(2,)`` factors of odometry's variances, about the vertical and about other axes.
+        with_first: ``(K,)`` covariances with their component's first node; None: that is the root.
     """
 
     state: State
     variance: np.ndarray
     apart: np.ndarray
     factor: np.ndarray
+    with_first: np.ndarray | None
 
     @property
     def step_variance(self) -> float:
@@ -59,7 +61,8 @@ def held_by_gravity(problem: Problem, state: State, solved: Factorised) -> Held:
     vertical = None if "tilt" in problem.without else problem.upright
     sound = np.flatnonzero(state.is_good[:segments])
     if vertical is None or len(sound) == 0:
-        return Held(state, solved.variance[nodes], solved.resistance[:segments], np.ones(2))
+        told = solved.variance[nodes], solved.resistance[:segments], np.ones(2)
+        return Held(state, *told, _with_first(problem, state, [solved], np.ones(1)))
     axis = vertical.sharpened(residuals(problem, state)[sound], 1 / solved.weight[sound])
     about = np.outer(axis, axis)
     both = _Both(problem, solved, sound, (about, np.eye(3) - about))
@@ -75,7 +78,18 @@ def held_by_gravity(problem: Problem, state: State, solved: Factorised) -> Held:
             break
     of_nodes = np.tensordot(_COMPONENTS, [each.variance[nodes] for each in solves], 1) / 3
     apart = np.tensordot(_COMPONENTS, [each.resistance[:segments] for each in solves], 1) / 3
-    return Held(state, of_nodes, apart, used)
+    return Held(state, of_nodes, apart, used, _with_first(problem, state, solves, _COMPONENTS / 3))
+
+
+def _with_first(problem: Problem, state: State, solves: list[Factorised], share: np.ndarray) -> np.ndarray | None:
+    """``(K,)`` rad² of key nodes and their component's first node, averaged; None where that is the root."""
+    graph = problem.drawn(state.noise)
+    if graph.is_held_at_first:
+        return None
+    column = np.zeros((solves[0].system.size, 1))
+    column[: graph.num_nodes] = graph.first_column
+    told = [each.solve(column)[: graph.num_nodes, 0] for each in solves]
+    return np.asarray(np.tensordot(share, told, 1))
 
 
 @dataclass(frozen=True)

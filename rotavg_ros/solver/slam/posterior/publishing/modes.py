@@ -40,7 +40,7 @@ class Published:
         correction: ``(4, K)``.
         outlier_probability: ``(E,)``.
         of_restated: ``(n,)`` the same of closures that are made of odometry.
-        variance: ``(N,)`` rad², of the view-graph's nodes.
+        variance: ``(N,)`` rad², of the view-graph's nodes, relative to the first of their component.
         noise: noise of the likeliest labelling.
         chosen: index of the mode whose orientations are published, the median.
         rivals: probabilities of the averaged labellings, the best first; those under other noise after all others.
@@ -73,12 +73,10 @@ def publish(problem: Problem, modes: list[Mode], tuned: Callable[[Mode], Mode] =
     """
     rivals, share = (modes[:1], np.ones(1)) if "rivals" in problem.without else distinct(problem, modes)
     answers = [of_mode(tuned(mode)) for mode in rivals]
-    middle = median([answer.correction for answer in answers], share)
-    chosen = answers[middle]
-    turns = [
-        quaternion_rows.log(quaternion_rows.multiply(quaternion_rows.inverse(chosen.correction), answer.correction))
-        for answer in answers
-    ]
+    seen = [answer.graph.from_first(answer.correction) for answer in answers]
+    middle = median(seen, share)
+    chosen, base = answers[middle], quaternion_rows.inverse(seen[middle])
+    turns = [quaternion_rows.log(quaternion_rows.multiply(base, each)) for each in seen]
     score, of_restated = (
         sum(weight * getattr(answer, name) for weight, answer in zip(share, answers, strict=True))
         for name in ("outlier_probability", "of_restated")
@@ -87,7 +85,8 @@ def publish(problem: Problem, modes: list[Mode], tuned: Callable[[Mode], Mode] =
     variance = np.zeros(len(chosen.variance))
     for weight, answer, turn in zip(share, answers, turns, strict=True):
         off = np.sqrt((turn**2).sum(axis=0) / k)
-        spread = (1 - graph.fraction) * off[graph.above] + graph.fraction * off[graph.below]
+        spread = graph.interpolated(off)
+        spread[graph.first] = 0.0  # by definition, where rivals turn the ends of its segment otherwise
         variance += weight * (answer.variance + spread**2)
     warnings = warnings_of(problem, rivals, share, turns, middle)
     number = next(number for number, mode in enumerate(modes) if mode is rivals[middle])
@@ -197,7 +196,7 @@ def of_mode(mode: Mode) -> Published:
             left_out = leave_one_out(problem, state, factorised)
     spend(_SCORED * len(state.trusted))
     graph, held = problem.drawn(state.noise), held_by_gravity(problem, state, factorised)
-    variance = graph.variance(held.variance, held.apart, held.step_variance)
+    variance = graph.variance(held.variance, held.apart, held.step_variance, held.with_first)
     answer = Published(graph, held.state.correction, score, np.zeros(0), variance, state.noise, 0, (1.0,))
     if len(graph.restated.edge) == 0:
         return answer
