@@ -16,7 +16,7 @@ from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.row_errors import closure_turns, mean_over_axes, mean_turn
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.poses.uncertainty import variances
-from rotavg_ros.solver.slam.posterior.publishing.modes import FAR_TURN, LIKELY, median, warning_of_rivals
+from rotavg_ros.solver.slam.posterior.publishing.modes import FAR_TURN, LIKELY, warning_of_rivals
 from rotavg_ros.solver.slam.stages import outlier_scores
 from rotavg_ros.view_graph import FALSE_CLOSURE_M
 
@@ -61,7 +61,7 @@ def answer(rivals: list[PoseMode], share: np.ndarray) -> tuple[Poses, int]:
     single = [_of_mode(pose) for pose in rivals]
     seen = [_seen_from(rivals[0].problem.drawn.first, each) for each in single]
     orientations = [np.ascontiguousarray(other.body_from_world.T) for other in seen]
-    middle = median(orientations, share)
+    middle = _median(seen, share)
     chosen, base = single[middle], quaternion_rows.inverse(orientations[middle])
     turns = np.array([quaternion_rows.log(quaternion_rows.multiply(base, other)) for other in orientations])
     shifts = np.array([other.position - seen[middle].position for other in seen])
@@ -81,6 +81,25 @@ def answer(rivals: list[PoseMode], share: np.ndarray) -> tuple[Poses, int]:
         _warnings(rivals[middle].problem.graph.is_odometry.numpy(), seen, seen[middle], share, turns),
     )
     return poses, middle
+
+
+def _median(seen: list[Poses], share: np.ndarray) -> int:
+    """Index of the answer with the least mean distance to all, weighted by their shares.
+
+    The distance is the mean over nodes of the length of a difference of poses. A turn counts in standard deviations of
+    orientations, a shift in those of positions: a pose errs by both together, and neither radians nor metres say how
+    much of a difference is one. The units are medians over all nodes and answers, one for the map: next to the first
+    node deviations vanish, and where nothing holds a robot they are as large as the map.
+    """
+    units = [np.sqrt(np.median([getattr(each, name) for each in seen])) for name in ("variance", "position_variance")]
+    of_turns, of_shifts = np.maximum(units, np.finfo(np.float64).tiny).tolist()
+
+    def distance(one: Poses, other: Poses) -> float:
+        cosine = np.abs((one.body_from_world * other.body_from_world).sum(axis=1))
+        shift = np.linalg.norm(one.position - other.position, axis=1)
+        return float(np.hypot(2 * np.arccos(np.minimum(cosine, 1.0)) / of_turns, shift / of_shifts).mean())
+
+    return int(np.argmin(np.array([[distance(one, other) for other in seen] for one in seen]) @ share))
 
 
 def _seen_from(first: np.ndarray, poses: Poses) -> Poses:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from rotavg_ros.evaluation.slam import stress
 from rotavg_ros.solver.algebra import quaternion_rows
@@ -15,6 +16,8 @@ from rotavg_ros.solver.neurora.network_store import load_network
 from rotavg_ros.solver.running.work import metered
 from rotavg_ros.solver.slam import stages
 from rotavg_ros.solver.slam.network import SlamCleanNet
+from rotavg_ros.solver.slam.poses import answer as published
+from rotavg_ros.solver.slam.poses.answer import Poses, answer
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
@@ -24,6 +27,8 @@ from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.solve import Found, search
 from rotavg_ros.view_graph import ViewGraph
+
+from .test_poses import graph_of, pose_mode, simulated
 
 
 def found_of(kind: str, seed: int, without: Collection[str] = ()) -> tuple[ViewGraph, np.ndarray, Found]:
@@ -120,3 +125,29 @@ def test_labellings_hold_the_same_closures_up_to_single_ones() -> None:
         trusted = mode.state.trusted.copy()
         trusted[closure[changed]] = 1 - trusted[closure[changed]]
         assert mode.holds_like(replace(mode.state, trusted=trusted)) == is_alike
+
+
+def test_the_median_goes_by_places_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two of three labellings agree on where half of the map lies; the third lies between them in orientation."""
+    mode = pose_mode(graph_of(simulated(0, num_keyframes=100)))
+    single = published._of_mode(mode)
+    behind = np.arange(len(single.position)) >= 50
+
+    def doctored(turn: float, shift: float) -> Poses:
+        turned = Rotation.from_rotvec(turn * behind[:, None] * [0.0, 0.0, 1.0])
+        orientation = (Rotation.from_quat(single.body_from_world) * turned).as_quat()
+        position = single.position + shift * behind[:, None] * [1.0, 0.0, 0.0]
+        return replace(single, body_from_world=orientation, position=position)
+
+    rivals = [replace(mode) for _ in range(3)]
+    made = {id(each): doctored(turn, x) for each, turn, x in zip(rivals, (0.0, 1e-4, 2e-4), (0, 20, 0), strict=True)}
+    monkeypatch.setattr(published, "_of_mode", lambda pose: made[id(pose)])
+    share = np.array([0.45, 0.30, 0.25])
+    found, middle = answer(rivals, share)
+    assert middle == 0
+    # The third answer is told of: in the uncertainty, and in a warning.
+    assert found.position_variance[behind].min() > 0.3 * 20.0**2 / mode.problem.shifts
+    assert len(found.warnings) == 1 and "20.0 m" in found.warnings[0]
+    # In metres as in turns: where places agree, orientations decide.
+    made.update({id(each): doctored(turn, 0.0) for each, turn in zip(rivals, (0.0, 0.1, 0.2), strict=True)})
+    assert answer(rivals, share)[1] == 1
