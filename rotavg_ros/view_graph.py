@@ -237,10 +237,20 @@ class ViewGraph:
 
     @cached_property
     def rotation_components(self) -> int:
-        """1 if all measured rotations share one axis (planar motion), else 3."""
-        vectors = log(self.target_from_source)
+        """1 if all measured rotations share one axis (planar motion), else 3; see :attr:`tells_dimension`."""
+        vectors = log(self.target_from_source[self.tells_dimension])
         spread = torch.linalg.eigvalsh(vectors.T @ vectors)
         return 1 if float(spread[1]) <= _PLANAR_SPREAD * float(spread[2]) else 3
+
+    @cached_property
+    def tells_dimension(self) -> Tensor:
+        """``(M,)`` bool, the edges that say whether all motion is in a plane: a user's rejected ones say nothing.
+
+        But if these alone join some parts, one part lies by them relative to another, in any plane: then all count.
+        """
+        usable = self.label != EdgeLabel.REJECTED
+        is_joined = bool(usable.all()) or int(self.components(usable).max()) == int(self.components().max())
+        return usable if is_joined else torch.ones_like(usable)
 
     @cached_property
     def _components(self) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import networkx
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import EdgeKind, ViewGraph, ViewGraphError
+from rotavg_ros.view_graph import EdgeLabel
 
 _UNIT = [0.0, 0.0, 0.0, 1.0]
 
@@ -161,6 +163,16 @@ def test_components_are_networkxs(num_nodes: int, pairs: list[tuple[int, int]]) 
     assert [component[node] for group in groups for node in sorted(group)] == [
         number for number, group in enumerate(groups) for _ in group
     ]
+
+
+def test_a_rejected_edge_tells_no_dimension_unless_it_alone_joins_parts() -> None:
+    flat, tilted = [0.0, 0.0, 0.1, 0.99**0.5], [0.1, 0.0, 0.0, 0.99**0.5]
+    label = [EdgeLabel.AUTOMATIC, EdgeLabel.AUTOMATIC, EdgeLabel.REJECTED]
+    within = ViewGraph.create([0, 1, 0], [1, 2, 2], [flat, flat, tilted], label=label)
+    assert within.rotation_components == 1
+    assert replace(within, label=torch.zeros(3, dtype=torch.int64)).rotation_components == 3
+    between = ViewGraph.create([0, 2, 1], [1, 3, 2], [flat, flat, tilted], label=label)
+    assert between.rotation_components == 3
 
 
 def test_select_edges() -> None:

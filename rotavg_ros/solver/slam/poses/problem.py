@@ -101,9 +101,10 @@ class PoseProblem:
         """``(3, k)`` axes of turns and ``(3, m)`` of shifts: one and two where all motion is in a plane, else three."""
         if self.mode.problem.components == 3:
             return np.eye(3), np.eye(3)
-        vectors = rotations.log(self.graph.target_from_source).numpy()
+        told = self.graph.tells_dimension
+        vectors = rotations.log(self.graph.target_from_source[told]).numpy()
         normal = np.linalg.eigh(vectors.T @ vectors)[1][:, 2]
-        off = np.abs(self.lengths @ normal).max(initial=0.0)
+        off = np.abs(self.lengths[told.numpy()] @ normal).max(initial=0.0)
         is_planar = off <= _PLANAR * np.abs(self.lengths).max(initial=0.0)
         return normal[:, None], _across(normal) if is_planar else np.eye(3)
 

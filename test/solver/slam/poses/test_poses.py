@@ -363,6 +363,28 @@ def test_labels_decide() -> None:
     assert set(np.flatnonzero(~same)) <= {wrong, right}
 
 
+@pytest.mark.parametrize(("with_places", "height", "tilt"), [(True, 1e-4, 0.0), (True, 0.0, 0.01), (False, 0.0, 0.01)])
+def test_a_rejected_closure_off_the_plane_changes_nothing(with_places: bool, height: float, tilt: float) -> None:
+    """All else is in a plane, and so is the answer, as certain as before."""
+    graph = graph_of(simulated(0, num_keyframes=200))
+    assert graph.translation is not None
+    closure = int(np.flatnonzero(~graph.is_odometry.numpy())[5])
+    label, shift, turn = graph.label.clone(), graph.translation.clone(), graph.target_from_source.clone()
+    label[closure] = EdgeLabel.REJECTED
+    shift[closure, 2] += height
+    turn[closure] = rotations.multiply(rotations.exp(torch.tensor([tilt, 0.0, 0.0]).double()), turn[closure])
+    off = replace(graph, label=label, translation=shift, target_from_source=rotations.canonical(turn))
+    expected, found = (
+        solve(each if with_places else replace(each, translation=None)) for each in (replace(graph, label=label), off)
+    )
+    same_orientations(expected, found, 0.05)
+    torch.testing.assert_close(found.uncertainty[1:], expected.uncertainty[1:], rtol=0.01, atol=0)
+    if expected.position is not None and found.position is not None:
+        assert (expected.position - found.position).norm(dim=1).max() < 0.001
+        assert expected.position_uncertainty is not None and found.position_uncertainty is not None
+        torch.testing.assert_close(found.position_uncertainty[1:], expected.position_uncertainty[1:], rtol=0.01, atol=0)
+
+
 def test_repeated_edges_count_once() -> None:
     graph = graph_of(simulated(8, false_share=0.2))
     twice = torch.cat((torch.arange(graph.num_edges), torch.arange(graph.num_edges // 3)))
