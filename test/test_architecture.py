@@ -182,9 +182,9 @@ ROOMS: dict[str, dict[str, set[str]]] = {
             *("solved", "state"),
         },
         "search": {"closures", "em", "places", "problem", "repeats", "row_errors", "rows", "solved"},
-        "answer": {"closures", "problem", "row_errors", "solved"},
-        "memory": {"answer", "closures", "em", "problem", "row_errors", "solved", "state"},
-        "solve": {"answer", "em", "memory", "problem", "search", "solved"},
+        "publishing": {"closures", "displacements", "problem", "row_errors", "rows", "solved"},
+        "memory": {"closures", "em", "problem", "publishing", "row_errors", "solved", "state"},
+        "solve": {"em", "memory", "problem", "publishing", "search", "solved"},
     },
     "solver/slam/posterior": {
         "": set(),

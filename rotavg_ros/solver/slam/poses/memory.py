@@ -14,10 +14,10 @@ import torch
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.odometry_lengths import ways_passed
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
-from rotavg_ros.solver.slam.poses.answer import Poses
 from rotavg_ros.solver.slam.poses.closures import Places
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.publishing.answer import Poses
 from rotavg_ros.solver.slam.poses.row_errors import mean_turn
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.poses.state import PoseNoise, PoseState

@@ -9,11 +9,11 @@ import torch
 
 from rotavg_ros.solver.running.kept_labels import KeptLabels
 from rotavg_ros.solver.slam.graph.odometry_paths import beside_the_chain
-from rotavg_ros.solver.slam.poses.answer import answer
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.memory import PoseMemory
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.publishing.answer import answer
 from rotavg_ros.solver.slam.poses.search.rivals import rival_poses
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.mode import Mode

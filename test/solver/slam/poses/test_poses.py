@@ -20,9 +20,9 @@ from rotavg_ros.metrics.positions import position_errors
 from rotavg_ros.solver import Solution, solve
 from rotavg_ros.solver.neurora.network_store import Networks
 from rotavg_ros.solver.slam.network import SlamCleanNet
-from rotavg_ros.solver.slam.poses.answer import Poses, answer
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.publishing.answer import Poses, answer
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.stages import bootstrap

@@ -16,11 +16,11 @@ from rotavg_ros.solver.neurora.network_store import load_network
 from rotavg_ros.solver.running.work import metered
 from rotavg_ros.solver.slam import stages
 from rotavg_ros.solver.slam.network import SlamCleanNet
-from rotavg_ros.solver.slam.poses import answer as published
-from rotavg_ros.solver.slam.poses.answer import Poses, answer
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.publishing import answer as published
+from rotavg_ros.solver.slam.poses.publishing.answer import Poses, answer
 from rotavg_ros.solver.slam.poses.search.rivals import rival_poses
 from rotavg_ros.solver.slam.poses.search.settling import settling
 from rotavg_ros.solver.slam.posterior.em import polish

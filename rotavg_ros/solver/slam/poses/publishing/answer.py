@@ -11,11 +11,11 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
 from rotavg_ros.solver.slam.poses.closures import GOOD, Predictions
-from rotavg_ros.solver.slam.poses.inner_nodes import poses_of_nodes
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.publishing.inner_nodes import poses_of_nodes
+from rotavg_ros.solver.slam.poses.publishing.uncertainty import variances
 from rotavg_ros.solver.slam.poses.row_errors import closure_turns, mean_over_axes, mean_turn
 from rotavg_ros.solver.slam.poses.solved import PoseMode
-from rotavg_ros.solver.slam.poses.uncertainty import variances
 from rotavg_ros.solver.slam.posterior.publishing.modes import FAR_TURN, LIKELY, warning_of_rivals
 from rotavg_ros.solver.slam.stages import outlier_scores
 from rotavg_ros.view_graph import FALSE_CLOSURE_M

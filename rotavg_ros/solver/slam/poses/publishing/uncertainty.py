@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rotavg_ros.solver.slam.poses.inner_nodes import InnerNodes, NodePoses
+from rotavg_ros.solver.slam.poses.publishing.inner_nodes import InnerNodes, NodePoses
 from rotavg_ros.solver.slam.poses.rows import crossed
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 
