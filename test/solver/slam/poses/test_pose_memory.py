@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,7 +16,7 @@ from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.solver.solution import Solution
-from rotavg_ros.view_graph import EdgeLabel
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
 from .test_poses import HILLS, displaced, graph_of, held_by_gravity, simulated
 
@@ -45,6 +46,22 @@ def apart(first: Solution, second: Solution) -> tuple[float, float]:
     assert first.position is not None and second.position is not None
     turned = rotations.angle_between(first.body_from_world, second.body_from_world)
     return float(torch.rad2deg(turned.max())), float((first.position - second.position).norm(dim=1).max())
+
+
+def with_second_odometry(run: SimulatedRun, source: int, target: int) -> ViewGraph:
+    """The run's graph with one more edge of odometry, beside the chain, that does not err."""
+    graph = graph_of(run)
+    assert graph.translation is not None
+    body_from_world = rotations.inverse(torch.from_numpy(run.world_from_body))
+    turn = rotations.multiply(body_from_world[target], rotations.inverse(body_from_world[source]))
+    way = torch.from_numpy(run.position[target] - run.position[source])
+    return ViewGraph.create(
+        torch.cat((torch.tensor([source]), graph.source)),
+        torch.cat((torch.tensor([target]), graph.target)),
+        torch.cat((turn[None], graph.target_from_source)),
+        kind=torch.cat((torch.tensor([EdgeKind.ODOMETRY]), graph.kind)),
+        translation=torch.cat((rotations.rotate(body_from_world[source], way)[None], graph.translation)),
+    )
 
 
 def test_odometry_alone_is_laid_on_as_a_whole_solve_has_it() -> None:
@@ -106,6 +123,25 @@ def test_updates_say_what_a_whole_solve_says(made: Callable[[], ViewGraph]) -> N
     assert float(turned.max()) < 1.5 * float(whole.uncertainty.median())
     assert apart(answer, whole)[1] < 0.1
     assert ((answer.outlier_score > 0.5) != (whole.outlier_score > 0.5)).sum() <= 1
+
+
+@pytest.mark.parametrize("kept", [False, True], ids=["memory", "labels"])
+def test_the_first_closure_comes_after_places(kept: bool) -> None:
+    """Odometry and another odometry's edge beside it give places, before there are any closures."""
+    run = simulated(0)
+    graph = with_second_odometry(run, 10, 14)
+    without = graph.select_edges(graph.is_odometry)
+    first = torch.nonzero(~graph.is_odometry)[0, 0].item()
+    grown = graph.select_edges(torch.cat((torch.nonzero(graph.is_odometry)[:, 0], torch.tensor([first]))))
+    before = solve(without)
+    memory = before.memory
+    assert isinstance(memory, SlamMemory) and memory.poses is not None and len(memory.poses.edge) == 0
+    found = solve(grown, warm_start=before.body_from_world, memory=memory.labels if kept else memory)
+    assert "refine" not in found.stage_seconds
+    assert float(found.outlier_score[-1]) < 0.5
+    whole = solve(grown)
+    turned, moved = apart(found, whole)
+    assert np.radians(turned) < 0.2 * float(whole.uncertainty.max()) and moved < 0.05
 
 
 def test_a_label_makes_places_anew() -> None:

@@ -126,17 +126,18 @@ class PoseStart:
 
     def over(self, places: Places) -> Places:
         """These places, with those of new closures taken from ``places``."""
-        is_new, column, even = self.column < 0, self.column, self.places.even
-        if even.shape[1:] != places.even.shape[1:]:
-            # The robot has left the plane.
-            even = np.tile(np.eye(places.even.shape[1]), (len(even), 1, 1))
-        return replace(
-            places,
-            chance=np.where(is_new, places.chance, self.places.chance[:, column]),
-            weight=np.where(is_new, places.weight, self.places.weight[column]),
-            rotation_weight=np.where(is_new, places.rotation_weight, self.places.rotation_weight[column]),
-            even=np.where(is_new[:, None, None], places.even, even[column]),
-        )
+        known = np.flatnonzero(self.column >= 0)
+        column, even = self.column[known], places.even.copy()
+        # Else the robot has left the plane.
+        if self.places.even.shape[1:] == even.shape[1:]:
+            even[known] = self.places.even[column]
+        else:
+            even[known] = np.eye(even.shape[1])
+        chance, weight, rotation = places.chance.copy(), places.weight.copy(), places.rotation_weight.copy()
+        chance[:, known] = self.places.chance[:, column]
+        weight[known] = self.places.weight[column]
+        rotation[known] = self.places.rotation_weight[column]
+        return replace(places, chance=chance, weight=weight, rotation_weight=rotation, even=even)
 
 
 def with_believed(problem: PoseProblem, places: Places, closures: np.ndarray, noise: PoseNoise, scale: Scale) -> Places:
