@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from rotavg_ros.solver.algebra.odometry_lengths import typical_length, ways_passed
 from rotavg_ros.solver.running.kept_labels import KeptLabels
 from rotavg_ros.solver.slam.graph.odometry_paths import beside_the_chain
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
@@ -21,6 +22,10 @@ from rotavg_ros.view_graph import ViewGraph
 
 # Metres; odometry with a longer step gives no places, so that squares do not overflow.
 _ABSURD = 1e100
+# Odometry gives no places either where the square of its longest step is rounded by more than this, in typical steps
+# squared: what all else predicts across that step is a difference of such squares. Odometry and closures usually err by
+# a hundredth of a step and more. (Steps of 10^6 m among usual ones of .5 m ended in singular covariances.)
+_ROUNDED = 1e-2**2
 
 
 def has_places(graph: ViewGraph) -> bool:
@@ -32,7 +37,17 @@ def has_places(graph: ViewGraph) -> bool:
     if not known[chain].all() or not known[~chain].any():
         chain = chain & torch.from_numpy(~beside_the_chain(graph))
     moves = bool(graph.translation[chain].any())
-    return moves and bool(known[chain].all()) and bool(known[~chain].any())
+    return moves and bool(known[chain].all()) and bool(known[~chain].any()) and _is_resolved(graph, chain.numpy())
+
+
+def _is_resolved(graph: ViewGraph, chain: np.ndarray) -> bool:
+    """Whether squares of the longest step of odometry, ``(M,)`` bool, resolve that of what a typical one errs by."""
+    way, steps = ways_passed(_translations(graph)[chain]), graph.steps.numpy()[chain]
+    farthest = np.sqrt(_ROUNDED / np.finfo(np.float64).eps)
+    # The median of all is no longer than a typical step, and takes a tenth of the time.
+    if way.max() < farthest * np.median(way / steps):
+        return True
+    return bool(way.max() < farthest * typical_length(way, steps, np.ones(len(way), dtype=bool)))
 
 
 def median_poses(

@@ -13,6 +13,7 @@ from rotavg_ros.evaluation.common.cases import drawings
 from rotavg_ros.evaluation.slam import stress
 from rotavg_ros.solver.slam.poses.em.estimate import judge_of
 from rotavg_ros.solver.slam.poses.repeats.neighbours import wrong_share
+from rotavg_ros.solver.slam.poses.solve import has_places
 
 from .test_poses import errors, graph_of, pose_mode, simulated
 from .test_pulls import alike
@@ -72,15 +73,30 @@ def test_a_false_closure_moves_nothing_however_far_it_leads(kind: str, seed: int
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize(("metres", "tells"), [(1e12, True), (1e150, False), (1e300, False)])
-def test_absurd_odometry_breaks_nothing(metres: float, tells: bool) -> None:
-    graph = graph_of(simulated(4))
+@pytest.mark.parametrize("where", [7, 150])
+@pytest.mark.parametrize(
+    ("metres", "tells"), [(1e5, True), (1e6, False), (1e15, False), (1e30, False), (1e150, False), (1e300, False)]
+)
+def test_absurd_odometry_breaks_nothing(metres: float, tells: bool, where: int) -> None:
+    """Whatever headings err by: covariances across such a step grow with the square of both."""
+    graph = graph_of(simulated(4, num_keyframes=300, odometry_noise_deg=10.0))
     assert graph.translation is not None
     translation = graph.translation.clone()
-    translation[int(torch.nonzero(graph.is_odometry)[7, 0]), 0] = metres
+    translation[int(torch.nonzero(graph.is_odometry)[where, 0]), 0] = metres
     answer = solve(replace(graph, translation=translation))
-    assert torch.isfinite(answer.body_from_world).all()
+    assert torch.isfinite(answer.body_from_world).all() and torch.isfinite(answer.outlier_score).all()
     assert (answer.position is not None) == tells
+
+
+@pytest.mark.parametrize("factor", [1e-20, 1e20])
+def test_a_robot_in_other_units_has_places(factor: float) -> None:
+    """Where it stands for most of its keyframes, too: steps are not compared with its reports of no motion."""
+    graph = graph_of(simulated(4))
+    assert graph.translation is not None
+    translation = factor * graph.translation
+    stands = torch.nonzero(graph.is_odometry)[:300, 0]
+    translation[stands] *= 1e-12
+    assert has_places(replace(graph, translation=translation))
 
 
 @pytest.mark.large
