@@ -16,9 +16,10 @@ from rotavg_ros.evaluation.common.cases import Case
 from rotavg_ros.evaluation.slam import pose_cases
 from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver.solution import Solution
+from rotavg_ros.view_graph import EdgeLabel
 
 from .test_pose_memory import go_on, up_to
-from .test_poses import graph_of, simulated
+from .test_poses import HILLS, errors, graph_of, simulated
 
 
 def case_of(kind: str, seed: int) -> Case:
@@ -99,6 +100,33 @@ def test_a_robot_whose_steps_are_short_jumps_nowhere(shared_data: Path, share: f
     solution = solve(begun)
     assert solution.position is not None and not warned_of_jumps(solution)
     assert not (solution.outlier_score > 0.5)[begun.is_odometry].any()
+
+
+@pytest.mark.parametrize("share", [0.3, pytest.param(1.0, marks=pytest.mark.large)])
+@pytest.mark.parametrize("hills", [False, True])
+def test_accepted_closures_tell_of_a_jump(hills: bool, share: float) -> None:
+    """They cannot join wrong places, so those across the jump are in the tails until it is found."""
+    run = simulated(0, num_keyframes=300, **(HILLS if hills else {}))
+    graph = jumped(graph_of(run), 151, (5.0, 3.0, 0.0))
+    accepted = ~graph.is_odometry & (torch.from_numpy(np.random.default_rng(0).random(graph.num_edges)) < share)
+    solution = solve(replace(graph, label=torch.where(accepted, EdgeLabel.ACCEPTED, graph.label)))
+    assert len(warned_of_jumps(solution)) == 1
+    assert float(solution.outlier_score[~graph.is_odometry].max()) < 0.5
+    assert errors(run, solution)[1] < 0.1
+
+
+@pytest.mark.parametrize("accepted", [False, True])
+def test_one_closure_tells_of_a_jump_if_it_is_accepted(accepted: bool) -> None:
+    """Else it joins a wrong place as likely."""
+    graph = graph_of(simulated(0, num_keyframes=300))
+    spans = (torch.minimum(graph.source, graph.target) < 151) & (torch.maximum(graph.source, graph.target) >= 151)
+    across = torch.nonzero(spans & ~graph.is_odometry)[:, 0]
+    kept = torch.ones(graph.num_edges, dtype=torch.bool)
+    kept[across[1:]] = False
+    label = graph.label.clone()
+    label[across[0]] = EdgeLabel.ACCEPTED if accepted else EdgeLabel.AUTOMATIC
+    solution = solve(jumped(replace(graph, label=label), 151, (5.0, 3.0, 0.0)).select_edges(kept))
+    assert bool(warned_of_jumps(solution)) == accepted
 
 
 @pytest.mark.large

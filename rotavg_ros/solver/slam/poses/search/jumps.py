@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rotavg_ros.solver.running.work import rest
-from rotavg_ros.solver.slam.poses.closures import given_turn
+from rotavg_ros.solver.slam.poses.closures import TAILS, given_turn
 from rotavg_ros.solver.slam.poses.em.estimate import judge_of
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
@@ -24,7 +24,7 @@ from rotavg_ros.solver.slam.posterior.labels.prior import log_slip_prior
 
 # Shifts agree if they differ by at most this many standard deviations of their uncertainty.
 _AGREE = 3.0
-# Minimum number of closures for a jump; a single one is explained equally well by a wrong place.
+# Minimum number of closures for a jump; a single one is explained equally well by a wrong place, unless accepted.
 _LEAST_WITNESSES = 2
 _WRONG = 0.5
 # Maximum number of shifts that are examined, those proposed by the closures of largest gain first; number of these for
@@ -54,7 +54,7 @@ class Jump:
         back: the segment that undoes the jump; -1 if none does.
         shift: ``(3,)`` metres by which everything behind the jump, up to ``back``, is displaced.
         gained: nats by which closures become likelier, each judged independently, minus the cost of the jump.
-        freed: ``(C,)`` bool, closures judged wrong that the jump makes right.
+        freed: ``(C,)`` bool, closures that do not fit and that the jump makes right.
     """
 
     segment: int
@@ -65,24 +65,19 @@ class Jump:
 
 
 def likeliest_jump(pose: PoseMode) -> Jump | None:
-    """The jump of largest predicted gain; None if none makes at least two closures right."""
+    """The jump of largest predicted gain; None if none makes at least two closures right, or an accepted one."""
     witnesses = _Witnesses.of(pose)
     proposers: list[int] = []
     left = witnesses.is_wrong.copy()
-    while left.sum() >= _LEAST_WITNESSES and len(proposers) < _LOOKED_AT:
+    while witnesses.are_enough(left) and len(proposers) < _LOOKED_AT:
         # The closure of largest gain proposes the next shift; those that agree with it need not propose theirs.
         proposers.append(int(np.argmax(np.where(left, witnesses.gain, -1.0))))
         left &= ~witnesses.agreeing(proposers[-1])
-    best = _best([witnesses.jump(pose, proposer, witnesses.place(proposer)) for proposer in proposers])
+    best = witnesses.best([witnesses.jump(pose, proposer, witnesses.place(proposer)) for proposer in proposers])
     if best is not None and best.gained > 0:
         return best
     several = [witnesses.jump(pose, proposer, witnesses.stretch(proposer)) for proposer in proposers[:_STRETCHES]]
-    return _best([jump for jump in (best, *several) if jump is not None])
-
-
-def _best(jumps: list[Jump]) -> Jump | None:
-    told = [jump for jump in jumps if jump.freed.sum() >= _LEAST_WITNESSES]
-    return max(told, key=lambda jump: jump.gained, default=None)
+    return witnesses.best([jump for jump in (best, *several) if jump is not None])
 
 
 def with_jump(pose: PoseMode, jump: Jump) -> tuple[PoseProblem, PoseStart]:
@@ -159,7 +154,8 @@ class _Witnesses:
     Attributes:
         shift: ``(C, m)`` metres by which everything behind the jump would be displaced, according to each closure.
         spread: ``(C,)`` m² per component, variance of that shift.
-        is_wrong: ``(C,)`` bool, closures that are judged to join wrong places.
+        is_wrong: ``(C,)`` bool, closures that are judged to join wrong places, or accepted ones in the tails.
+        is_accepted: ``(C,)`` bool, closures that somebody has labelled accepted.
         gain: ``(C,)`` nats that a wrong closure gains by becoming right, or that a right one loses by becoming wrong.
         first, last: ``(C,)`` segments that each closure spans: first ≤ s < last; none if no odometry joins its ends.
         segment: ``(S,)`` edges of the closure graph.
@@ -170,6 +166,7 @@ class _Witnesses:
     shift: np.ndarray
     spread: np.ndarray
     is_wrong: np.ndarray
+    is_accepted: np.ndarray
     gain: np.ndarray
     first: np.ndarray
     last: np.ndarray
@@ -187,7 +184,10 @@ class _Witnesses:
         log_here = here.log_turn - np.log(2 * np.pi * total).sum(axis=1) / 2
         places = solved.places
         can_tell = told.is_known & (drawn.chain[drawn.source] == drawn.chain[drawn.target])[mode.closure]
-        is_wrong = (places.right < _WRONG) & can_tell & (told.label == 0)
+        # A label rules wrong places out: where an accepted closure does not fit, it is in the tails.
+        is_accepted = told.label > 0
+        is_off = np.where(is_accepted, places.chance[TAILS] > _WRONG, places.right < _WRONG)
+        is_wrong = is_off & can_tell & (told.label >= 0)
         # A jump that removes a wrong closure's offset gives it at least the density log_here; a right closure that is
         # displaced loses its right place.
         judge = judge_of(problem)
@@ -207,7 +207,17 @@ class _Witnesses:
         variance = problem.could_jump[order]
         shift = told.sign[:, None] * solved.predictions.mean[:, k:]
         spread = np.trace(solved.predictions.covariance[:, k:, k:], axis1=1, axis2=2) / problem.shifts
-        return cls(shift, spread + own, is_wrong, gain, first, last, order, np.where(jumps, 0.0, price), variance)
+        closures = shift, spread + own, is_wrong, is_accepted, gain, first, last
+        return cls(*closures, order, np.where(jumps, 0.0, price), variance)
+
+    def are_enough(self, closures: np.ndarray) -> bool:
+        """Whether closures ``(C,)`` bool, if they agree, are evidence for a jump."""
+        return bool(closures.sum() >= _LEAST_WITNESSES or (closures & self.is_accepted).any())
+
+    def best(self, jumps: list[Jump]) -> Jump | None:
+        """The jump of largest predicted gain among those for which there is evidence; None if there are none."""
+        told = [jump for jump in jumps if self.are_enough(jump.freed)]
+        return max(told, key=lambda jump: jump.gained, default=None)
 
     def agreeing(self, proposer: int, sign: float = 1.0) -> np.ndarray:
         """``(C,)`` bool, wrong closures with the same shift as the proposing one; with ``sign`` -1, the opposite."""
