@@ -24,7 +24,7 @@ from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.rows import tails, variances
 from rotavg_ros.solver.slam.posterior.state import RUN_STEPS
 from rotavg_ros.solver.slam.posterior.system import NormalEquations
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # Motion counts as planar if shifts off the plane are below this share of the longest.
 _PLANAR = 1e-6
@@ -206,17 +206,26 @@ class PoseProblem:
         return np.asarray(np.maximum(self.way - (steps - 1) * self.typical, self.way / steps))
 
     @cached_property
+    def _could_jump_by(self) -> np.ndarray:
+        """``(M,)`` metres by which each edge could jump, about; 0 where somebody has accepted it."""
+        is_accepted = (self.graph.label == EdgeLabel.ACCEPTED).numpy()
+        return np.where(is_accepted, 0.0, np.maximum(self._step_reports, LEAST_LENGTH * self.typical))
+
+    @cached_property
     def longest_steps(self) -> np.ndarray:
-        """``(S,)`` the edge with the longest reported step in each segment."""
+        """``(S,)`` the edge with the longest reported step in each segment, of those that could jump."""
         segment = self.drawn.segment_of_edge
         edge = np.flatnonzero(segment >= 0)
-        order = np.lexsort((-self._step_reports[edge], segment[edge]))
+        order = np.lexsort((-self._could_jump_by[edge], segment[edge]))
         return np.asarray(edge[order][np.unique(segment[edge][order], return_index=True)[1]])
 
     @cached_property
     def could_jump(self) -> np.ndarray:
-        """``(S,)`` m² per component, variance of a jump of each segment: the square of its longest reported step."""
-        return np.asarray(np.maximum(self._step_reports[self.longest_steps], LEAST_LENGTH * self.typical) ** 2)
+        """``(S,)`` m² per component, variance of a jump of each segment: the square of its longest reported step.
+
+        0 where all of a segment's steps are accepted.
+        """
+        return np.asarray(self._could_jump_by[self.longest_steps] ** 2)
 
     @cached_property
     def tailed(self) -> np.ndarray:

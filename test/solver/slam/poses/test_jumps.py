@@ -15,6 +15,7 @@ from rotavg_ros.datasets.simulation.poses.odometry_jumps import STEPS
 from rotavg_ros.evaluation.common.cases import Case
 from rotavg_ros.evaluation.slam import pose_cases
 from rotavg_ros.metrics import orientation_errors
+from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import EdgeLabel
 
@@ -113,6 +114,22 @@ def test_accepted_closures_tell_of_a_jump(hills: bool, share: float) -> None:
     assert len(warned_of_jumps(solution)) == 1
     assert float(solution.outlier_score[~graph.is_odometry].max()) < 0.5
     assert errors(run, solution)[1] < 0.1
+
+
+def test_accepted_odometry_does_not_jump() -> None:
+    """Nor the step that is said to be right, where only that one is: its neighbour in the segment is blamed."""
+    run = simulated(0, num_keyframes=300)
+    graph = jumped(graph_of(run), 151, (5.0, 3.0, 0.0))
+    far = int(torch.nonzero(graph.is_odometry & (graph.target == 151))[0])
+    for accepted in (graph.is_odometry, torch.arange(graph.num_edges) == far):
+        solution = solve(replace(graph, label=torch.where(accepted, EdgeLabel.ACCEPTED, graph.label)))
+        assert float(solution.outlier_score[accepted].max()) == 0.0
+        memory = solution.memory
+        assert isinstance(memory, SlamMemory) and memory.poses is not None
+        jump = memory.poses.pose.problem.jump
+        assert jump is None or not jump[accepted.numpy()].any()
+        if accepted.sum() > 1:
+            assert not warned_of_jumps(solution)
 
 
 @pytest.mark.parametrize("accepted", [False, True])

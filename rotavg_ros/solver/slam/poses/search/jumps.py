@@ -160,7 +160,7 @@ class _Witnesses:
         first, last: ``(C,)`` segments that each closure spans: first ≤ s < last; none if no odometry joins its ends.
         segment: ``(S,)`` edges of the closure graph.
         price: ``(S,)`` nats, cost of a jump in each; 0 if it jumps already.
-        variance: ``(S,)`` m² per component, prior variance of a jump in each.
+        variance: ``(S,)`` m² per component, prior variance of a jump in each; 0 where there can be none.
     """
 
     shift: np.ndarray
@@ -272,10 +272,11 @@ class _Witnesses:
         """
         square, known = float((self.shift[proposer] ** 2).sum()), float(self.spread[proposer])
         width = self.shift.shape[1] * np.log1p(self.variance / known) / 2
-        off = square / (2 * np.maximum(self.variance, np.finfo(np.float64).tiny))
         # Shortest shift that is compatible with its uncertainty.
         least = max(np.sqrt(square) - _AGREE * np.sqrt(self.shift.shape[1] * known), 0.0)
-        off[least**2 > _AS_FAR**2 * self.variance] = np.inf
+        could = (self.variance > 0) & (least**2 <= _AS_FAR**2 * self.variance)
+        off = np.full(len(self.variance), np.inf)
+        off[could] = square / (2 * self.variance[could])
         return np.asarray(np.where(self.price > 0, self.price + off + width, 0.0))
 
     def _changed(self, proposer: int, sign: float = 1.0) -> np.ndarray:
