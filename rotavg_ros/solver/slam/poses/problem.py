@@ -252,11 +252,15 @@ class PoseProblem:
         return np.asarray(self.drawn.view_graph_edge[self.mode.problem.closure - self.drawn.num_segments])
 
     @cached_property
+    def chain_number(self) -> np.ndarray:
+        """``(K,)`` number, from 0, of the chain of odometry that each key node belongs to."""
+        return np.asarray(np.unique(self.drawn.chain, return_inverse=True)[1])
+
+    @cached_property
     def chains(self) -> np.ndarray:
         """``(C, 2)`` numbers, from 0, of the chains of odometry at closures' ends."""
         drawn, closure = self.drawn, self.mode.problem.closure
-        number = np.unique(drawn.chain, return_inverse=True)[1]
-        return np.asarray(number[np.stack((drawn.source[closure], drawn.target[closure]), axis=1)])
+        return np.asarray(self.chain_number[np.stack((drawn.source[closure], drawn.target[closure]), axis=1)])
 
     @cached_property
     def within_chain(self) -> np.ndarray:

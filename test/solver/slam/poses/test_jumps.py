@@ -12,6 +12,7 @@ import torch
 from rotavg_ros import ViewGraph, rotations, solve
 from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.datasets.simulation.poses.odometry_jumps import STEPS
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 from rotavg_ros.evaluation.common.cases import Case
 from rotavg_ros.evaluation.slam import pose_cases
 from rotavg_ros.metrics import orientation_errors
@@ -114,6 +115,30 @@ def test_accepted_closures_tell_of_a_jump(hills: bool, share: float) -> None:
     assert len(warned_of_jumps(solution)) == 1
     assert float(solution.outlier_score[~graph.is_odometry].max()) < 0.5
     assert errors(run, solution)[1] < 0.1
+
+
+def two_robots(run: SimulatedRun, joint: int) -> ViewGraph:
+    """The run as two robots', with a jump of the second one's in its middle, and no closures of that one to itself."""
+    graph = jumped(graph_of(run), joint + (graph_of(run).num_nodes - joint) // 2 + 1, (5.0, 3.0, 0.0))
+    first = torch.minimum(graph.source, graph.target)
+    between = graph.is_odometry & (first == joint - 1)
+    of_second = ~graph.is_odometry & (first >= joint)
+    return graph.select_edges(~between & ~of_second)
+
+
+# In the plane the first robot rests with what precedes the jump, on the hills with what follows.
+@pytest.mark.parametrize(
+    ("seed", "hills"),
+    [(0, False), (0, True), *(pytest.param(2, hills, marks=pytest.mark.large) for hills in (False, True))],
+)
+def test_closures_to_another_robot_tell_of_a_jump(seed: int, hills: bool) -> None:
+    options = {"num_keyframes": 300, "laps": 2.0, "closures_per_keyframe": 0.25} | (HILLS if hills else {})
+    run = simulated(seed, **options)
+    graph = two_robots(run, 150)
+    solution = solve(graph)
+    assert len(warned_of_jumps(solution)) == 1
+    assert float(solution.outlier_score[~graph.is_odometry].max()) < 0.5
+    assert errors(run, solution)[1] < 0.15
 
 
 def test_accepted_odometry_does_not_jump() -> None:

@@ -22,8 +22,8 @@ from rotavg_ros.solver.running.work import rest, stop_if_abandoned
 from rotavg_ros.solver.slam.poses.em.estimate import judge_of
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.repeats.neighbours import log_all_right
-from rotavg_ros.solver.slam.poses.row_errors import closure_turns, stated_variance
-from rotavg_ros.solver.slam.poses.rows import jacobian
+from rotavg_ros.solver.slam.poses.row_errors import stated_variance
+from rotavg_ros.solver.slam.poses.search.discrepancies import discrepancies
 from rotavg_ros.solver.slam.poses.search.settling import LEAST_GAIN, SLACK, Rival, moved
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 
@@ -173,7 +173,7 @@ class _Run:
         stop_if_abandoned()
         rest()
         d = pose.problem.turns + pose.problem.shifts
-        total, off = _discrepancies(pose, members)
+        total, off = discrepancies(pose, members)
         precision = inverse_of(total)
         while len(members) >= _LEAST_MEMBERS:
             pulled = (precision @ off).reshape(-1, d)
@@ -195,14 +195,3 @@ class _Run:
             off = off[stays]
             members, held = np.delete(members, least), np.delete(held, least)
         return None
-
-
-def _discrepancies(pose: PoseMode, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance ``(K d, K d)`` of the discrepancies of K closures if they are right, and these ``(K d,)``."""
-    problem, solved, k = pose.problem, pose.solved, pose.problem.turns
-    rows, d = problem.mode.problem.closure[members], problem.turns + problem.shifts
-    own = np.repeat(closure_turns(problem, pose.state.noise)[members, None], d, axis=1)
-    shared = np.where(problem.run[problem.mode.problem.closure] >= 0, pose.state.noise.common, 0.0)
-    own[:, k:] = (stated_variance(problem, pose.state) - shared)[members, None]
-    total = solved.factor.covariance_between(jacobian(problem, solved.way)[rows], rows) + np.diag(own.ravel())
-    return total, solved.predictions.mean[members].ravel()

@@ -1,0 +1,20 @@
+"""Discrepancies of several closures that do not pull, jointly: those of a run, or of all across a jump."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rotavg_ros.solver.slam.poses.row_errors import closure_turns, stated_variance
+from rotavg_ros.solver.slam.poses.rows import jacobian
+from rotavg_ros.solver.slam.poses.solved import PoseMode
+
+
+def discrepancies(pose: PoseMode, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance ``(K d, K d)`` of the discrepancies of K closures if they are right, and these ``(K d,)``."""
+    problem, solved, k = pose.problem, pose.solved, pose.problem.turns
+    rows, d = problem.mode.problem.closure[members], problem.turns + problem.shifts
+    own = np.repeat(closure_turns(problem, pose.state.noise)[members, None], d, axis=1)
+    shared = np.where(problem.run[problem.mode.problem.closure] >= 0, pose.state.noise.common, 0.0)
+    own[:, k:] = (stated_variance(problem, pose.state) - shared)[members, None]
+    total = solved.factor.covariance_between(jacobian(problem, solved.way)[rows], rows) + np.diag(own.ravel())
+    return total, solved.predictions.mean[members].ravel()
