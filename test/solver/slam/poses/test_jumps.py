@@ -141,6 +141,35 @@ def test_closures_to_another_robot_tell_of_a_jump(seed: int, hills: bool) -> Non
     assert errors(run, solution)[1] < 0.15
 
 
+@pytest.mark.parametrize("far", [6.0, pytest.param(60.0, marks=pytest.mark.large)])
+def test_a_second_odometry_tells_of_a_jump(far: float) -> None:
+    """It holds the map together across the jump: all closures fit, and the first odometry seems to err everywhere."""
+    run = simulated(1, num_keyframes=300)
+    graph = jumped(graph_of(run), 151, (far, 0.0, 0.0))
+    assert graph.translation is not None
+    rng, source, position = np.random.default_rng(0), torch.arange(0, 240, 6), torch.from_numpy(run.position)
+    body_from_world = rotations.inverse(torch.from_numpy(run.world_from_body))
+    turn = rotations.multiply(body_from_world[source + 5], rotations.inverse(body_from_world[source]))
+    way = rotations.rotate(body_from_world[source], position[source + 5] - position[source])
+    noise = rng.normal(size=(2, len(source), 3))
+    turn = rotations.multiply(rotations.exp(torch.from_numpy(0.01 * noise[0] * [0, 0, 1])), turn)
+    count = len(source)
+    beside = ViewGraph.create(
+        torch.cat((graph.source, source)),
+        torch.cat((graph.target, source + 5)),
+        torch.cat((graph.target_from_source, turn)),
+        kind=torch.cat((graph.kind, graph.kind.new_zeros(count))),
+        translation=torch.cat((graph.translation, way + torch.from_numpy(0.02 * noise[1] * [1, 1, 0]))),
+        steps=torch.cat((graph.steps, graph.steps.new_full((count,), 5))),
+    )
+    solution = solve(beside)
+    assert len(warned_of_jumps(solution)) == 1
+    assert errors(run, solution)[1] < 0.05
+    memory = solution.memory
+    assert isinstance(memory, SlamMemory) and memory.poses is not None
+    assert memory.poses.noise.way < 0.001
+
+
 def test_accepted_odometry_does_not_jump() -> None:
     """Nor the step that is said to be right, where only that one is: its neighbour in the segment is blamed."""
     run = simulated(0, num_keyframes=300)

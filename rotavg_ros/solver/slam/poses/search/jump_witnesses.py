@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.graph.chain_cuts import connected
 from rotavg_ros.solver.slam.poses.closures import TAILS, given_turn
@@ -37,7 +38,7 @@ _LEAST = 1e-12
 # Maximum number of closures whose densities given each other are computed; they take its third power of time.
 _MOST_TOGETHER = 200
 # Variance of a shift of which nothing is known, over the largest one of closures.
-_ANY = 1e6
+_ANY = 1e3
 
 
 @dataclass(frozen=True)
@@ -211,7 +212,11 @@ class Witnesses:
         moved = np.zeros((len(members), d, shifts))
         moved[:, d - shifts :] = np.append(self.sign[end], (sign * self.sign)[ends])[:, None, None] * np.eye(shifts)
         by_shift = moved.reshape(-1, shifts)
-        root = np.linalg.cholesky(total + _ANY * total.diagonal().max() * by_shift @ by_shift.T)
+        largest = float(total.diagonal().max())
+        total = total + _ANY * largest * by_shift @ by_shift.T
+        # Steps of a hundred kilometres leave less than rounding of what closures err by themselves.
+        total[np.diag_indices(len(total))] += len(total) * np.finfo(np.float64).eps * _ANY * largest
+        root = np.linalg.cholesky(total)
         white = solve_triangular(root, off, lower=True)
         log_density = -(white**2 / 2 + np.log(np.sqrt(2 * np.pi) * root.diagonal())).reshape(-1, d).sum(axis=1)
         gain = self.gain.copy()
@@ -321,6 +326,38 @@ class Witnesses:
         off = np.full(len(variance), np.inf)
         off[could] = square / (2 * variance[could])
         return np.asarray(np.where(price > 0, price + off + width, 0.0))
+
+
+def by_all_else(pose: PoseMode, price: float) -> Jump | None:
+    """The segment that is likeliest to have jumped by what all other rows predict of it; None if nothing could.
+
+    Odometry beside the chain holds places together across a jump: then all closures fit, and nothing is to be moved.
+
+    Args:
+        pose: poses.
+        price: nats, minus the log prior of one more jump.
+    """
+    problem, solved = pose.problem, pose.solved
+    could = np.flatnonzero((problem.jumps == 0) & (problem.could_jump > 0) & ~problem.slipped)
+    if len(could) == 0:
+        return None
+    others, covariance = solved.factor.without(could)
+    off = np.matmul(others, solved.left[could])[:, :, 0]
+    total = covariance + np.eye(off.shape[1])
+    # A jump's variance, in the units of the whitened row.
+    free = np.zeros((len(could), off.shape[1], problem.shifts))
+    free[:, problem.turns :] = inverse_root(solved.covariance[could][:, ::-1, ::-1])[:, ::-1, ::-1]
+    jumped = total + problem.could_jump[could, None, None] * free @ free.transpose(0, 2, 1)
+    gained = _log_normal(off, jumped) - _log_normal(off, total) - price
+    best = int(np.argmax(gained))
+    nowhere, none = np.zeros(problem.drawn.num_nodes, dtype=bool), np.zeros(len(problem.closures), dtype=bool)
+    return Jump(int(could[best]), -1, nowhere, np.zeros(3), float(gained[best]), none)
+
+
+def _log_normal(off: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """``(n,)`` nats, log densities of ``(n, d)`` with covariances ``(n, d, d)``, up to a constant."""
+    square = (off * np.linalg.solve(covariance, off[:, :, None])[:, :, 0]).sum(axis=1)
+    return np.asarray(-(square + np.linalg.slogdet(covariance)[1]) / 2)
 
 
 class _Ends(NamedTuple):

@@ -14,7 +14,7 @@ import numpy as np
 
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
-from rotavg_ros.solver.slam.poses.search.jump_witnesses import AS_FAR, Jump, Witnesses
+from rotavg_ros.solver.slam.poses.search.jump_witnesses import AS_FAR, Jump, Witnesses, by_all_else
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.labels.prior import log_slip_prior
@@ -33,8 +33,15 @@ def log_jump_prior(problem: PoseProblem) -> float:
 
 
 def likeliest_jump(pose: PoseMode) -> Jump | None:
-    """The jump of largest predicted gain; None if none makes at least two closures right, or an accepted one."""
-    witnesses = Witnesses.of(pose, _price(pose.problem))
+    """The jump of largest predicted gain, by closures that do not fit or by all that does; None if there is none."""
+    price = _price(pose.problem)
+    told = [jump for jump in (_by_witnesses(pose, price), by_all_else(pose, price)) if jump is not None]
+    return max(told, key=lambda jump: jump.gained, default=None)
+
+
+def _by_witnesses(pose: PoseMode, price: float) -> Jump | None:
+    """The likeliest jump by closures; None if none makes at least two right, or an accepted one."""
+    witnesses = Witnesses.of(pose, price)
     proposers: list[int] = []
     left = witnesses.is_wrong.copy()
     while witnesses.are_enough(left) and len(proposers) < _LOOKED_AT:
