@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
+from rotavg_ros.solver.algebra.spanning_forest import shortest_path_forest
+from rotavg_ros.view_graph import ViewGraph
 
 
 class RelaxedForest(NamedTuple):
@@ -30,6 +32,23 @@ def hubs(edges: SortedEdges, component: Tensor) -> Tensor:
     node = torch.arange(edges.num_nodes, device=component.device)
     candidate = torch.where(degree == highest[component], node, edges.num_nodes)
     return node.new_full((count,), edges.num_nodes).scatter_reduce(0, component, candidate, "amin")
+
+
+def cheapest_forest(
+    graph: ViewGraph, edges: SortedEdges, cost: Tensor, roots: Tensor, component: Tensor
+) -> RelaxedForest:
+    """Paths of least total cost: by Dijkstra's algorithm on a CPU, by rounds over all edges elsewhere.
+
+    Args:
+        edges: those of the graph, sorted.
+        cost: ``(M,)``, positive.
+        roots: ``(C,)`` one node of each component, in the components' order.
+        component: ``(N,)`` component of every node.
+    """
+    if graph.device.type != "cpu":
+        return relaxed_forest(edges, cost, roots)
+    forest = shortest_path_forest(graph, cost, roots, edges=edges, component=component)
+    return RelaxedForest(torch.from_numpy(forest.parent), torch.from_numpy(forest.parent_edge), roots)
 
 
 def relaxed_forest(edges: SortedEdges, cost: Tensor, roots: Tensor) -> RelaxedForest:

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from rotavg_ros.solver.algebra.medians import median_by_group
-from rotavg_ros.solver.algebra.relaxed_forest import RelaxedForest, hubs, relaxed_forest
+from rotavg_ros.solver.algebra.relaxed_forest import cheapest_forest, hubs
 from rotavg_ros.solver.algebra.residuals import EdgeResiduals
-from rotavg_ros.solver.algebra.spanning_forest import compose, shortest_path_forest
+from rotavg_ros.solver.algebra.spanning_forest import compose
 from rotavg_ros.solver.neurora.cleaned import Cleaned
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.running.threads import for_each, threads_on
@@ -54,7 +54,8 @@ def bootstrap(cleaned: Cleaned, component: Tensor | None = None) -> Bootstrapped
     ends = cleaned.graph.source, cleaned.graph.target
     fewest = torch.minimum(*(degree.float().index_select(0, end) for end in ends))
     cost = NUMBERS.edge_cost + NUMBERS.outlier_cost * cleaned.outlier_probability + NUMBERS.fringe_cost / fewest
-    parent, parent_edge, roots = _cheapest_forest(cleaned, cost, hubs(cleaned.edges, component), component)
+    roots = hubs(cleaned.edges, component)
+    parent, parent_edge, _ = cheapest_forest(cleaned.measured, cleaned.edges, cost, roots, component)
     rectified, raw = (compose(parent, parent_edge, graph) for graph in (cleaned.graph, cleaned.measured))
     rectified_misfit, raw_misfit = _misfits(cleaned, (rectified, raw), component)
     raw_is_better = raw_misfit <= rectified_misfit
@@ -82,16 +83,8 @@ def breadth_first(cleaned: Cleaned, component: Tensor | None = None) -> Bootstra
     # No path is longer than this, so that one outlier costs more than any number of inliers.
     cost = torch.where(is_inlier, 1.0, float(cleaned.graph.num_nodes))
     roots = hubs(cleaned.edges.select(is_inlier), component)
-    parent, parent_edge, roots = _cheapest_forest(cleaned, cost, roots, component)
+    parent, parent_edge, _ = cheapest_forest(cleaned.measured, cleaned.edges, cost, roots, component)
     return Bootstrapped(compose(parent, parent_edge, cleaned.graph), roots, parent, parent_edge, cleaned)
-
-
-def _cheapest_forest(cleaned: Cleaned, cost: Tensor, roots: Tensor, component: Tensor) -> RelaxedForest:
-    """Shortest paths from the ``roots`` ``(C,)``: Dijkstra's algorithm on a CPU, rounds over all edges elsewhere."""
-    if cleaned.graph.device.type != "cpu":
-        return relaxed_forest(cleaned.edges, cost, roots)
-    forest = shortest_path_forest(cleaned.graph, cost, roots, edges=cleaned.edges, component=component)
-    return RelaxedForest(torch.from_numpy(forest.parent), torch.from_numpy(forest.parent_edge), roots)
 
 
 def _misfits(cleaned: Cleaned, candidates: Sequence[Tensor], component: Tensor) -> list[Tensor]:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros.solver.algebra.canonical_form import evenly_spread
-from rotavg_ros.solver.algebra.relaxed_forest import relaxed_forest
+from rotavg_ros.solver.algebra.relaxed_forest import cheapest_forest
 from rotavg_ros.solver.algebra.residuals import SLICE_EDGES, EdgeResiduals, measured_rows
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.running.threads import for_each, slices, stretches
@@ -48,7 +48,7 @@ class Structure:
         nodes = torch.arange(graph.num_nodes, device=graph.device)
         roots = nodes.new_full((int(component.max()) + 1,), graph.num_nodes)
         roots = roots.scatter_reduce(0, component, nodes, "amin")
-        forest = relaxed_forest(edges, torch.ones_like(graph.precision), roots)
+        forest = cheapest_forest(graph, edges, torch.ones_like(graph.precision), roots, component)
         series = EdgesInSeries.of(graph, forest.parent, forest.parent_edge)
         return cls(component, roots, edges, series)
 

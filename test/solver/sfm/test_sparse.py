@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from rotavg_ros import ViewGraph, solve
 from rotavg_ros.metrics import orientation_errors
@@ -138,3 +139,25 @@ def test_bridges_are_found_and_a_tree_has_nothing_to_tell_by() -> None:
     assert (solution.outlier_score < 1e-3).all()
     tree = solve(measured(truth, np.arange(8), np.arange(1, 9)))
     assert (tree.outlier_score == 0).all()
+
+
+class _Operations(TorchDispatchMode):
+    """Counts operations on tensors."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
+        self.count += 1
+        return func(*args, **(kwargs or {}))
+
+
+def test_a_long_graph_takes_no_more_passes_than_a_short_one() -> None:
+    """Edges in series are told by a tree, which is as deep as half the ring: a pass for each level is quadratic."""
+    counts = []
+    for cameras in (100, 1000):
+        graph, _ = ring(0, cameras, 2, 0.0)
+        is_near = (graph.target - graph.source).abs() < 3
+        with _Operations() as operations:
+            Structure.of(graph.select_edges(is_near))
+        counts.append(operations.count)
+    assert counts[1] < 1.5 * counts[0]
