@@ -123,14 +123,15 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "refinement": {"noise_density", "noise_shape", "priors", "step", "symmetric_rows"},
         "step": {"laplacians", "noise_density", "noise_shape", "priors", "series", "symmetric_rows"},
         "series": set(),
+        "rejected": set(),
         "stated": {"noise_shape", "priors", "refinement", "step"},
         "cycles": {"priors"},
         "consensus": {"cycles", "priors"},
         "starts": {"cycles", "priors", "refinement", "step"},
         "certainty": {"laplacians", "priors", "starts"},
         "solve": {
-            *("certainty", "consensus", "cycles", "options", "priors", "refinement", "series", "starts"),
-            *("stated", "step"),
+            *("certainty", "consensus", "cycles", "options", "priors", "refinement", "rejected", "series"),
+            *("starts", "stated", "step"),
         },
     },
     "solver/slam": {

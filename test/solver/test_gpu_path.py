@@ -54,9 +54,10 @@ def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> Non
     # The seven columns of a view-graph, and every node's component.
     to_gpu = [(edges,)] * 6 + [(edges, 4), (nodes,)]
     from_gpu = [(edges,), (nodes, 4)]
-    # The components that are left without the rejected edges, which are found on the CPU.
+    # The components that are left without the rejected edges, which are found on the CPU. All else is of these edges.
+    edges = int((graph.label != EdgeLabel.REJECTED).sum())
     to_gpu += [(nodes,)]
-    from_gpu += [(int((graph.label != EdgeLabel.REJECTED).sum()),)] * 2
+    from_gpu += [(edges,)] * 2
     if method != "neurora-v2":
         # Parts that few edges join are looked for on the CPU: in the graph, given its residuals, weights and an answer.
         from_gpu += [(edges,)] * 8 + [(edges, 4), (nodes, 4)]

@@ -8,7 +8,7 @@ from torch import Tensor
 from rotavg_ros.solver.algebra.medians import median_by_group
 from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.neurora.numbers import NUMBERS
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 
 def residual_score(
@@ -17,9 +17,17 @@ def residual_score(
     """Probability ``(M,)`` float64 that an edge's noise exceeds ``outlier_angle`` (radians), from its residual.
 
     The residual differs from the noise by the error of the orientations at the edge's ends. The probability is one half
-    at the outlier angle; the better the ends are known, the closer it is to certainty on either side.
+    at the outlier angle; the better the ends are known, the closer it is to certainty on either side. Edges that the
+    user has rejected score 1 and say nothing of others.
     """
-    return residual_probability(*residual_and_uncertainty(graph, body_from_world, component), outlier_angle)
+    is_allowed = graph.label != EdgeLabel.REJECTED
+    if bool(is_allowed.all()):
+        return residual_probability(*residual_and_uncertainty(graph, body_from_world, component), outlier_angle)
+    score = torch.ones(graph.num_edges, dtype=torch.float64, device=graph.device)
+    allowed = graph.select_edges(is_allowed)
+    if allowed.num_edges:
+        score[is_allowed] = residual_score(allowed, body_from_world, outlier_angle, component)
+    return score
 
 
 def residual_probability(angle: Tensor, uncertainty: Tensor, outlier_angle: float) -> Tensor:

@@ -302,7 +302,7 @@ class RefinementPriors:
         step_tolerance: share of a step that conjugate gradients may leave to the next step.
         least_angle: radians: the same as an absolute value; the limit of single precision.
         least_square: floor of a residual's expected square, in variances of the noise, numerical.
-        least_prior: floor of an edge's weight, numerical: keeps nodes attached whose edges are all rejected.
+        least_prior: floor of an edge's weight, numerical: keeps nodes attached all of whose edges seem false.
         coarse_noise: radians: where residuals are typically larger, single precision is used; its error of 10⁻⁷ rad
             then shows in no answer.
         least_residual: radians: floor of the typical residual, numerical.

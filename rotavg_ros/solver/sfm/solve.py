@@ -31,6 +31,7 @@ from rotavg_ros.solver.sfm.cycles.evidence import with_triangles
 from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine, settle
+from rotavg_ros.solver.sfm.rejected import in_one_frame
 from rotavg_ros.solver.sfm.series import EdgesInSeries
 from rotavg_ros.solver.sfm.starts.choice import Start, begin, settle_best
 from rotavg_ros.solver.sfm.starts.others import other_starts
@@ -50,11 +51,38 @@ _NEARLY_AS_GOOD = (
 
 
 def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) -> Estimate:
-    """One method on a graph, on the graph's device.
+    """One method on a graph, on the graph's device; edges that the user has rejected take no part.
 
     Args:
         component: ``(N,)`` component of every node.
     """
+    kept = (graph.label != EdgeLabel.REJECTED).nonzero()[:, 0]
+    if len(kept) == graph.num_edges:
+        return _solved(graph, component, stages, run)
+    allowed = graph.select_edges(kept)
+    part = allowed.components()
+    if allowed.num_edges:
+        estimate = _solved(allowed, part, stages, run)
+    else:
+        every = rotations.identity(graph.num_nodes, device=graph.device)
+        estimate = Estimate(every, every.new_empty(0), torch.full((graph.num_nodes,), torch.nan))
+    score = torch.ones(graph.num_edges, dtype=torch.float64, device=graph.device)
+    score[kept] = estimate.outlier_score.to(score)
+    estimate = replace(estimate, outlier_score=score)
+    if torch.equal(part, component):
+        return estimate
+    return in_one_frame(graph, component, part, estimate, _num_steps(stages, run) > 0)
+
+
+def _num_steps(stages: SfmStages, run: Run) -> int:
+    """Maximum number of refinement steps."""
+    if run.refinement_steps is not None:
+        return run.refinement_steps
+    return PRIORS.max_steps if stages.refine else 0
+
+
+def _solved(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) -> Estimate:
+    """One method on a graph without rejected edges."""
     networks, watch = run.networks, run.watch
     if graph.num_edges > _TUNING_PAYS and graph.device.type == "cpu":
         tune()
@@ -85,9 +113,7 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             else:
                 orientations = fine_tune(networks.load(FineNet), cleaned, orientations, component)
     answer = _Answer(orientations)
-    steps = run.refinement_steps
-    if steps is None:
-        steps = PRIORS.max_steps if stages.refine else 0
+    steps = _num_steps(stages, run)
     if steps > 0:
         answer = _refined(cleared, orientations, stages, steps, watch)
     score, variance = cleaned.outlier_probability.double(), torch.full((graph.num_nodes,), torch.nan)
@@ -166,9 +192,9 @@ def _refined(cleared: _Cleared, orientations: Tensor, stages: SfmStages, steps: 
     graph, structure = cleared.judged.measured, cleared.structure
     component = structure.component
     with watch.stage("refine"):
-        allowed = (graph.label != EdgeLabel.REJECTED).double()
-        coarse = 1 - cleared.cleaned.outlier_probability if stages.weighted else torch.ones_like(allowed)
-        weights = EdgeWeights(allowed, allowed * coarse)
+        good = (1 - cleared.cleaned.outlier_probability).double()
+        alike = torch.ones_like(good)
+        weights = EdgeWeights(alike, good if stages.weighted else alike)
         priors = replace(PRIORS if stages.shaped else ROUND, max_steps=steps)
         if not stages.density:
             priors = replace(priors, density=replace(priors.density, max_steps=0))
@@ -256,7 +282,7 @@ def _rows(body_from_world: Tensor) -> np.ndarray:
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:
     """The graph's connections; among edges in series, CleanNet's scores say which is to blame, as far as reliable."""
     graph = begun.cleaned.measured
-    series = _in_series(graph, begun)
+    series = EdgesInSeries.of(graph, begun.parent, begun.parent_edge)
     structure = Structure(component, begun.roots, begun.cleaned.edges, series)
     redundancy = structure.redundancy(graph)
     # In a component with a single cycle, CleanNet has no evidence to tell its edges apart.
@@ -265,12 +291,3 @@ def _structure(begun: Bootstrapped, component: Tensor) -> Structure:
     log_odds = begun.cleaned.outlier_probability[series.edge].double().logit()
     log_odds = trust * log_odds.clamp(-NUMBERS.max_logit, NUMBERS.max_logit)
     return replace(structure, series=series.blamed(log_odds))
-
-
-def _in_series(graph: ViewGraph, begun: Bootstrapped) -> EdgesInSeries:
-    """Edges in series, and bridges; edges that the user has rejected are neither, and check none."""
-    allowed = (graph.label != EdgeLabel.REJECTED).nonzero()[:, 0]
-    if len(allowed) == graph.num_edges:
-        return EdgesInSeries.of(graph, begun.parent, begun.parent_edge)
-    series = Structure.of(graph.select_edges(allowed)).series
-    return series._replace(edge=allowed[series.edge], bridge=allowed[series.bridge])

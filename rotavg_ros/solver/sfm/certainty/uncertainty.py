@@ -22,7 +22,7 @@ from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem, incidenc
 from rotavg_ros.solver.sfm.certainty.probes import probe_signs
 from rotavg_ros.solver.sfm.laplacians.scalar import ScalarLaplacian
 from rotavg_ros.solver.sfm.priors import RefinementPriors, UncertaintyPriors
-from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+from rotavg_ros.view_graph import ViewGraph
 
 _WELL_KNIT_DEGREE = RefinementPriors().well_knit_degree
 PRIORS = UncertaintyPriors()
@@ -69,8 +69,7 @@ def variances(graph: ViewGraph, noise: Tensor, score: Tensor, bridge: Tensor, to
     """
     count = len(to.node)
     size = torch.bincount(to.component, minlength=count)
-    # Edges that the user has rejected check nothing.
-    edges = torch.bincount(to.component[graph.source[graph.label != EdgeLabel.REJECTED]], minlength=count)
+    edges = torch.bincount(to.component[graph.source], minlength=count)
     is_checked, is_loose = edges >= size, 2 * edges < _WELL_KNIT_DEGREE * size
     weight, noise = (1 - score).clamp(min=PRIORS.least_weight), noise[to.component]
     turned = torch.zeros_like(score)

@@ -65,26 +65,22 @@ def consensus(
         angle: ``(M,)`` rad, residuals of the first answer; default: computed.
     """
     angle = EdgeResiduals(graph, body_from_world.float()).angles() if angle is None else angle
-    is_judged, is_off = graph.label != EdgeLabel.REJECTED, angle > NUMBERS.outlier_angle
-    judged = graph
-    if not bool(is_judged.all()):
-        judged, is_off = graph.select_edges(is_judged.nonzero()[:, 0]), is_off[is_judged]
-    count = int(component.max()) + 1
-    contradicting = Triangles.of(judged, count * priors.glance, is_off).contradicting(
-        is_off, component.index_select(0, judged.source), count, priors.closing[0]
+    is_off, count = angle > NUMBERS.outlier_angle, int(component.max()) + 1
+    contradicting = Triangles.of(graph, count * priors.glance, is_off).contradicting(
+        is_off, component.index_select(0, graph.source), count, priors.closing[0]
     )
     numbers = (contradicting > priors.contradicting).nonzero()[:, 0].tolist()
     if not numbers:
         return None
-    judged, of_node = judged.to("cpu"), component.cpu()
-    answer, weight = body_from_world.double().cpu().clone(), torch.ones(judged.num_edges, dtype=torch.float64)
-    of_edge, num_apart, is_other, is_too_large = of_node[judged.source], 0, False, False
+    device, graph, of_node = graph.device, graph.to("cpu"), component.cpu()
+    answer, weight = body_from_world.double().cpu().clone(), torch.ones(graph.num_edges, dtype=torch.float64)
+    of_edge, num_apart, is_other, is_too_large = of_node[graph.source], 0, False, False
     for number in numbers:
         node, edge = ((of == number).nonzero()[:, 0] for of in (of_node, of_edge))
         if len(node) > priors.max_nodes or len(edge) > priors.max_edges:
             is_too_large = True
             continue
-        found = _searched(_edges(judged, node, edge), answer[node], priors)
+        found = _searched(_edges(graph, node, edge), answer[node], priors)
         if found is not None:
             other = torch.from_numpy(np.ascontiguousarray(found.body_from_world.T))
             num_apart += _num_apart(answer[node], other)
@@ -94,9 +90,7 @@ def consensus(
     warnings = (*warnings, _TOO_LARGE) if is_too_large else warnings
     if not is_other:
         return Consensus(None, None, warnings)
-    of_all = torch.ones(graph.num_edges, dtype=torch.float64, device=graph.device)
-    of_all[is_judged] = weight.to(graph.device)
-    return Consensus(answer.to(graph.device), of_all, warnings)
+    return Consensus(answer.to(device), weight.to(device), warnings)
 
 
 def _edges(graph: ViewGraph, node: Tensor, edge: Tensor) -> Edges:
@@ -112,8 +106,6 @@ def _edges(graph: ViewGraph, node: Tensor, edge: Tensor) -> Edges:
 def _searched(edges: Edges, answer: Tensor, priors: ConsensusPriors) -> Fitted | None:
     """The likeliest answer if it is not the first one, ``answer`` ``(n, 4)``."""
     graph = ViewGraph.create(edges.source, edges.target, edges.measured.T, num_nodes=edges.num_nodes)
-    if bool((graph.components() > 0).any()):
-        return None  # it is connected only by edges that the user has rejected
     triangles = Triangles.of(graph, priors.max_triangles)
     first = fitted(edges, np.ascontiguousarray(answer.numpy().T), priors)
     others = [

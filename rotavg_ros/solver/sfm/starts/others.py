@@ -18,7 +18,7 @@ from rotavg_ros.solver.sfm.refinement import PRIORS, coarse_steps
 from rotavg_ros.solver.sfm.starts.choice import Start
 from rotavg_ros.solver.sfm.starts.spectral import spectral
 from rotavg_ros.solver.sfm.step import Problem, Structure
-from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+from rotavg_ros.view_graph import ViewGraph
 
 
 def is_sparse(graph: ViewGraph, component: Tensor) -> Tensor:
@@ -38,21 +38,21 @@ def other_starts(judged: Cleaned, is_believed: bool, parent_edge: Tensor, compon
         component: ``(N,)`` component of every node.
     """
     graph, sparse = judged.measured, is_sparse(judged.measured, component)
-    allowed = (graph.label != EdgeLabel.REJECTED).double()
+    alike = torch.ones(graph.num_edges, dtype=torch.float64, device=graph.device)
     starts: list[Start] = []
     if bool(sparse.any()):
-        starts += [Start(orientations, allowed, sparse) for orientations in _by_all_alike(graph, component)]
+        starts += [Start(orientations, alike, sparse) for orientations in _by_all_alike(graph, component)]
         if is_believed:
             verdict = by_triangles(judged, component)
             by_triangles_too = bootstrap(verdict, component).body_from_world
             starts.append(Start(by_triangles_too, 1 - verdict.outlier_probability, sparse))
     if not bool(sparse.all()):
         chosen = _part(graph, parent_edge)
-        part, weight = graph.select_edges(chosen), allowed[chosen]
+        part, weight = graph.select_edges(chosen), alike[chosen]
         _, by_eigenvectors = _by_all_alike(part, component)
         problem = Problem(part, Structure.of(part, component), PRIORS)
         settled, _ = coarse_steps(problem, by_eigenvectors, weight)
-        starts.append(Start(settled, allowed, ~sparse, is_settled=True))
+        starts.append(Start(settled, alike, ~sparse, is_settled=True))
     return starts
 
 
