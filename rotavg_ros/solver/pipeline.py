@@ -108,8 +108,9 @@ def solve(
     places = estimate.places
     score = _as_labelled(graph, estimate.outlier_score.cpu())
     rotation_score = None if places is None else _as_labelled(graph, places.rotation_score)
+    orientations = _root_at_identity(estimate.body_from_world.cpu(), job.component)
     return Solution(
-        _root_at_identity(estimate.body_from_world.cpu(), job.component),
+        orientations,
         score,
         job.component,
         estimate.variance.cpu().double().sqrt().masked_fill(_is_alone(job.component), 0.0),
@@ -122,6 +123,7 @@ def solve(
             *estimate.warnings,
             *stating_nothing,
             *warnings.mostly_flagged(graph, score, rotation_score, estimate.restated),
+            *(warnings.accepted_far_off(graph, orientations, NUMBERS.outlier_angle) if profile == "sfm" else ()),
         ),
         None if places is None else _root_at_origin(places.position, estimate.body_from_world, job.component),
         None if places is None else places.variance.sqrt(),

@@ -99,6 +99,28 @@ def mostly_flagged(
     )
 
 
+def accepted_far_off(graph: ViewGraph, body_from_world: Tensor, outlier_angle: float) -> tuple[str, ...]:
+    """Warns of edges that the user has accepted, and that are more than ``outlier_angle`` rad off in the answer.
+
+    Args:
+        graph: on the CPU, N nodes.
+        body_from_world: ``(N, 4)`` the answer.
+    """
+    accepted = graph.select_edges(graph.label == EdgeLabel.ACCEPTED)
+    if accepted.num_edges == 0:
+        return ()
+    residual = edge_residual(body_from_world, accepted.target_from_source, accepted.source, accepted.target)
+    angle = rotations.angle(residual)
+    far = int((angle > outlier_angle).sum())
+    if far == 0:
+        return ()
+    return (
+        f"{far} of {accepted.num_edges} accepted edges are more than {math.degrees(outlier_angle):.0f}° off in the "
+        f"answer, up to {math.degrees(float(angle.max())):.0f}°; they contradict each other, or the method does "
+        "not keep to labels: check which of them are right",
+    )
+
+
 def stating_nothing(graph: ViewGraph) -> tuple[str, ...]:
     """Warns if many edges of a graph without odometry state exactly no rotation, as some front ends do on failure.
 

@@ -10,12 +10,14 @@ import torch
 from torch import Tensor
 
 from rotavg_ros.solver.algebra.medians import median_by_group
-from rotavg_ros.solver.algebra.relaxed_forest import cheapest_forest, hubs
+from rotavg_ros.solver.algebra.relaxed_forest import RelaxedForest, cheapest_forest, hubs
 from rotavg_ros.solver.algebra.residuals import EdgeResiduals
+from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.algebra.spanning_forest import compose
 from rotavg_ros.solver.neurora.cleaned import Cleaned
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.running.threads import for_each, threads_on
+from rotavg_ros.view_graph import EdgeLabel
 
 # Number of edges that decide which of two trees fits better.
 _MISFIT_SAMPLE = 16_384
@@ -54,8 +56,7 @@ def bootstrap(cleaned: Cleaned, component: Tensor | None = None) -> Bootstrapped
     ends = cleaned.graph.source, cleaned.graph.target
     fewest = torch.minimum(*(degree.float().index_select(0, end) for end in ends))
     cost = NUMBERS.edge_cost + NUMBERS.outlier_cost * cleaned.outlier_probability + NUMBERS.fringe_cost / fewest
-    roots = hubs(cleaned.edges, component)
-    parent, parent_edge, _ = cheapest_forest(cleaned.measured, cleaned.edges, cost, roots, component)
+    parent, parent_edge, roots = _accepted_first(cleaned, cost, hubs(cleaned.edges, component), component)
     rectified, raw = (compose(parent, parent_edge, graph) for graph in (cleaned.graph, cleaned.measured))
     rectified_misfit, raw_misfit = _misfits(cleaned, (rectified, raw), component)
     raw_is_better = raw_misfit <= rectified_misfit
@@ -83,8 +84,35 @@ def breadth_first(cleaned: Cleaned, component: Tensor | None = None) -> Bootstra
     # No path is longer than this, so that one outlier costs more than any number of inliers.
     cost = torch.where(is_inlier, 1.0, float(cleaned.graph.num_nodes))
     roots = hubs(cleaned.edges.select(is_inlier), component)
-    parent, parent_edge, _ = cheapest_forest(cleaned.measured, cleaned.edges, cost, roots, component)
+    parent, parent_edge, roots = _accepted_first(cleaned, cost, roots, component)
     return Bootstrapped(compose(parent, parent_edge, cleaned.graph), roots, parent, parent_edge, cleaned)
+
+
+def _accepted_first(cleaned: Cleaned, cost: Tensor, roots: Tensor, component: Tensor) -> RelaxedForest:
+    """Shortest paths from the ``roots`` ``(C,)``; what accepted edges join is entered once, and left along these.
+
+    The parts that accepted edges join have trees of their own. Shortest paths between the parts join these trees.
+    """
+    graph, edges = cleaned.measured, cleaned.edges
+    accepted = (graph.label == EdgeLabel.ACCEPTED).nonzero()[:, 0]
+    if len(accepted) == 0:
+        return cheapest_forest(graph, edges, cost, roots, component)
+    within = graph.select_edges(accepted)
+    part, of_part = within.components(), SortedEdges.of(within)
+    inner = cheapest_forest(within, of_part, cost[accepted], hubs(of_part, part), part)
+    source, target = part[graph.source], part[graph.target]
+    between = (source != target).nonzero()[:, 0]
+    parts = replace(
+        graph.select_edges(between), num_nodes=int(part.max()) + 1, source=source[between], target=target[between]
+    )
+    outer = cheapest_forest(parts, SortedEdges.of(parts), cost[between], part[roots], parts.components())
+    joining = (accepted[inner.parent_edge[inner.parent_edge >= 0]], between[outer.parent_edge[outer.parent_edge >= 0]])
+    chosen = torch.cat(joining)
+    tree = graph.select_edges(chosen)
+    parent, parent_edge, _ = cheapest_forest(tree, SortedEdges.of(tree), cost[chosen], roots, component)
+    is_child = parent_edge >= 0
+    parent_edge[is_child] = chosen[parent_edge[is_child]]
+    return RelaxedForest(parent, parent_edge, roots)
 
 
 def _misfits(cleaned: Cleaned, candidates: Sequence[Tensor], component: Tensor) -> list[Tensor]:

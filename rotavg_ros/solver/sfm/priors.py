@@ -137,6 +137,8 @@ class ConsensusPriors:
         max_rounds: maximum number of rounds of expectation and maximisation.
         settled: nats; a round that improves the likelihood by less is the last.
         ahead: nats by which another answer has to be likelier; covers the rounding of two runs that find the same one.
+        contradicted: nats that an answer loses for an accepted edge that is more than 20° off: more than other edges of
+            a pair of views have to say.
     """
 
     contradicting: float = 5.0
@@ -155,6 +157,7 @@ class ConsensusPriors:
     max_rounds: int = 100
     settled: float = 0.01
     ahead: float = 1.0
+    contradicted: float = 1000.0
 
 
 @dataclass(frozen=True)
@@ -229,6 +232,8 @@ class AttachmentPriors:
         shells: rad; the density of the angle of false edges' errors is free, but constant in each shell between these.
             Smaller errors, which are not seen, have the first one's.
         shell_edges: prior number of edges in a shell with the volume of the whole sphere.
+        contradicted: nats that a turn loses for an accepted edge that is more than 20° off, or false: more than all
+            edges that join a part have to say, which is at most some 20 nats each.
     """
 
     ahead: float = 3.0
@@ -239,6 +244,7 @@ class AttachmentPriors:
     least_scale: float = float(np.radians(0.1))
     shells: tuple[float, ...] = tuple(float(np.radians(degrees)) for degrees in (20, 30, 45, 60, 90, 120, 150, 180))
     shell_edges: float = 2.0
+    contradicted: float = 1000.0
 
 
 @dataclass(frozen=True)
@@ -313,6 +319,9 @@ class RefinementPriors:
         half_trusted: number of edges beyond a cycle at which CleanNet's log-odds count by half in telling edges in
             series apart: it was trained on graphs in which many edges check each other. Orientations of the synthetic
             recipes, which have thousands of edges, do not depend on it.
+        accepted_square: accepted edges weigh no less than edges whose squared residual is this many times the typical
+            one, which the smallest residuals dominate: the mean is three to four times it. With 1, accepting good edges
+            makes answers a fifth worse, with 10 it does not (``docs/diary/sfm-refinement.md``).
         shape: how the noise's shape is estimated.
         density: which density the last steps use.
         starts: where the refinement begins.
@@ -343,6 +352,7 @@ class RefinementPriors:
     well_knit_degree: float = 12.0
     max_sample: int = 8_000
     half_trusted: float = 20.0
+    accepted_square: float = 10.0
     shape: NoiseShapePriors = NoiseShapePriors()
     density: DensityPriors = DensityPriors()
     starts: StartPriors = StartPriors()

@@ -37,11 +37,13 @@ from rotavg_ros.solver.sfm.starts.choice import Start, begin, settle_best
 from rotavg_ros.solver.sfm.starts.others import other_starts
 from rotavg_ros.solver.sfm.starts.parts import Parts
 from rotavg_ros.solver.sfm.stated.noise import StatedNoise
-from rotavg_ros.solver.sfm.step import Structure
+from rotavg_ros.solver.sfm.step import Structure, accepted_edges
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # For graphs with more edges it pays to measure which tile sizes are fastest on this machine.
 _TUNING_PAYS = 200_000
+# Log-odds that of edges in series an accepted one is to blame; finite, since all of them may be accepted.
+_BLAMELESS = -100.0
 # Quaternions that differ by less are the same.
 _ROUNDING = 1e-9
 _NEARLY_AS_GOOD = (
@@ -127,6 +129,7 @@ def _solved(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) ->
                 to = References(component, form.first_nodes())
                 if attached is not None:
                     score = torch.from_numpy(attached.scores(score.cpu().numpy())).to(score)
+                    score = labelled(score, graph.label)
                 stated = variances(graph, noise, score, cleared.structure.series.bridge, to)
                 if stated is not None and attached is not None:
                     turned = attached.variances(to.node[component].cpu().numpy())
@@ -283,11 +286,12 @@ def _structure(begun: Bootstrapped, component: Tensor) -> Structure:
     """The graph's connections; among edges in series, CleanNet's scores say which is to blame, as far as reliable."""
     graph = begun.cleaned.measured
     series = EdgesInSeries.of(graph, begun.parent, begun.parent_edge)
-    structure = Structure(component, begun.roots, begun.cleaned.edges, series)
+    structure = Structure(component, begun.roots, begun.cleaned.edges, series, accepted_edges(graph))
     redundancy = structure.redundancy(graph)
     # In a component with a single cycle, CleanNet has no evidence to tell its edges apart.
     others = (redundancy - 1).clamp(min=0)
     trust = (others / (others + PRIORS.half_trusted))[component[graph.source[series.edge]]]
     log_odds = begun.cleaned.outlier_probability[series.edge].double().logit()
     log_odds = trust * log_odds.clamp(-NUMBERS.max_logit, NUMBERS.max_logit)
+    log_odds = torch.where(graph.label[series.edge] == EdgeLabel.ACCEPTED, _BLAMELESS, log_odds)
     return replace(structure, series=series.blamed(log_odds))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from rotavg_ros.solver.algebra.canonical_form import evenly_spread
 from rotavg_ros.solver.algebra.relaxed_forest import cheapest_forest
 from rotavg_ros.solver.algebra.residuals import SLICE_EDGES, EdgeResiduals, measured_rows
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
+from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.running.threads import for_each, slices, stretches
 from rotavg_ros.solver.sfm.laplacians.block import Arrivals, BlockLaplacian, Laplacian, SplitWeights, factorised
 from rotavg_ros.solver.sfm.laplacians.edge import EdgeLaplacian, MatrixWeights
@@ -21,7 +23,7 @@ from rotavg_ros.solver.sfm.noise_shape import NoiseShape, ResidualSample, ShapeE
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.series import EdgesInSeries
 from rotavg_ros.solver.sfm.symmetric_rows import distinct_entries, full, times, turned
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 
 @dataclass(frozen=True)
@@ -33,12 +35,14 @@ class Structure:
         roots: ``(C,)`` one node of each component, in the components' order; it is held fixed.
         edges: the graph's edges, sorted.
         series: edges that only check each other.
+        accepted: ``(A,)`` edges that the user has accepted.
     """
 
     component: Tensor
     roots: Tensor
     edges: SortedEdges
     series: EdgesInSeries
+    accepted: Tensor
 
     @classmethod
     def of(cls, graph: ViewGraph, component: Tensor | None = None) -> Structure:
@@ -50,7 +54,7 @@ class Structure:
         roots = roots.scatter_reduce(0, component, nodes, "amin")
         forest = cheapest_forest(graph, edges, torch.ones_like(graph.precision), roots, component)
         series = EdgesInSeries.of(graph, forest.parent, forest.parent_edge)
-        return cls(component, roots, edges, series)
+        return cls(component, roots, edges, series, accepted_edges(graph))
 
     def redundancy(self, graph: ViewGraph) -> Tensor:
         """Number of edges of each component beyond a spanning tree, ``(C,)``."""
@@ -187,6 +191,9 @@ class Problem:
         self.roots, self.component = structure.roots, structure.component
         self.degree, self.series = structure.edges.degree, structure.series
         self._in_series = graph.select_edges(self.series.edge)
+        self._accepted, self._believed = structure.accepted, structure.accepted
+        if len(self._accepted):  # the weights of those in series are by their blame
+            self._believed = self._accepted[~torch.isin(self._accepted, self.series.edge)]
         self.arrivals = Arrivals(structure.edges)
         self.round = NoiseShape.round(graph.num_nodes, graph.device)
         self.is_well_knit = 2 * graph.num_edges >= priors.well_knit_degree * graph.num_nodes
@@ -232,10 +239,18 @@ class Problem:
         return torch.exp(self._sum_of_some(logarithm) / self._count_of_some)
 
     def cost(self, orientations: Tensor, weight: Tensor) -> Tensor:
-        """Σ w ‖r‖^½ of each component, ``(C,)``; weights ``(M,)``."""
+        """Σ w ‖r‖^½ of each component, ``(C,)``; weights ``(M,)``.
+
+        An accepted edge that is no good one, as accepted edges are, costs more than all edges can.
+        """
         angle = EdgeResiduals(self.graph, orientations.float()).angles()
         of_edge = self.component.index_select(0, self.graph.source)
-        return weight.new_zeros(len(self.roots)).index_add(0, of_edge, weight * angle.sqrt())
+        cost = weight.new_zeros(len(self.roots)).index_add(0, of_edge, weight * angle.sqrt())
+        if len(self._accepted):
+            most = weight.new_zeros(len(self.roots)).index_add(0, of_edge, weight * math.sqrt(math.pi))
+            of_contradicted = of_edge[self._accepted[angle[self._accepted] > NUMBERS.outlier_angle]]
+            cost = cost.index_add(0, of_contradicted, most[of_contradicted])
+        return cost
 
     def log_likelihood(self, orientations: Tensor, weight: Tensor) -> Tensor:
         """Nats ``(C,)`` of the edges of some weight ``(M,)`` under round noise of the density that fits them best."""
@@ -251,19 +266,38 @@ class Problem:
 
         Their squared residuals give only their total error. Each edge is expected to have its share of the blame in it.
         """
-        graph, series = self._in_series, self.series
-        if graph.num_edges == 0:
+        series = self.series
+        if len(series.edge) == 0:
             return prior
-        rows = measure.rows(torch.float64)
-        vector = EdgeResiduals(graph, orientations).vectors(slice(0, graph.num_edges))
-        vector = measure.in_units(vector, series.edge)
-        own = Expected.of(vector, *(rows.index_select(1, end) for end in (graph.source, graph.target)))
+        own = self._errors(self._in_series, series.edge, orientations, measure)
         together = series.sums(own.square)[series.group]
         squares = (series.blame * together, own.square)
         weights = (measure.weigh(square + own.variance, series.edge) for square in squares)
         pooled = prior.clone()
         pooled[series.edge] *= (next(weights) / next(weights)).to(prior)
         return pooled
+
+    def _errors(self, graph: ViewGraph, edge: Tensor, orientations: Tensor, measure: Measure) -> Expected:
+        """Residuals of the edges ``edge`` ``(k,)``, given these as a graph."""
+        rows = measure.rows(torch.float64)
+        vector = measure.in_units(EdgeResiduals(graph, orientations).vectors(slice(0, graph.num_edges)), edge)
+        return Expected.of(vector, *(rows.index_select(1, end) for end in (graph.source, graph.target)))
+
+    def _believing(self, orientations: Tensor, measure: Measure, prior: Tensor) -> Tensor:
+        """Prior weights ``(M,)`` under which no accepted edge weighs less than a good one, however far off it is.
+
+        A node's variance is that of a mean over its edges, so those of an edge's ends tell how far edges typically err.
+        """
+        if len(self._believed) == 0:
+            return prior
+        graph = self.graph.select_edges(self._believed)
+        own = self._errors(graph, self._believed, orientations, measure)
+        typical = own.variance / sum(1 / self.degree[end].double() for end in (graph.source, graph.target))
+        squares = (own.square.minimum(self.priors.accepted_square * typical), own.square)
+        weights = (measure.weigh(square + own.variance, self._believed) for square in squares)
+        believing = prior.clone()
+        believing[self._believed] *= (next(weights) / next(weights)).to(prior)
+        return believing
 
     def density(self, sample: ResidualSample, measure: Measure, prior: Tensor) -> NoiseDensity:
         """The maximum-likelihood density of sampled residuals, in their units; edges of no weight are left out."""
@@ -293,7 +327,7 @@ class Problem:
 
     def step(self, orientations: Tensor, measure: Measure, prior: Tensor, is_open: Tensor) -> Step:
         """The least-squares step of the open components ``(C,)``; it is zero in the others."""
-        weights, matrix, force = self._pull(orientations, measure, prior)
+        weights, matrix, force = self._pull(orientations, measure, self._believing(orientations, measure, prior))
         force *= is_open[self.component]
         system: Laplacian
         if matrix is None:
@@ -352,6 +386,11 @@ class Problem:
 
         for_each(walk, range(len(parts)))
         return Pull(weights, matrix, torch.stack(forces).sum(dim=0))
+
+
+def accepted_edges(graph: ViewGraph) -> Tensor:
+    """Indices ``(A,)`` of the edges that the user has accepted."""
+    return (graph.label == EdgeLabel.ACCEPTED).nonzero()[:, 0]
 
 
 def l1_weight(squared_residual: Tensor, _: slice | Tensor) -> Tensor:

@@ -6,8 +6,9 @@ false, and the camera is turned. So for each part (``starts/parts.py``) the post
     p(T | edges) ∝ Π_e (1 − p) ρ(W_e T⁻¹) + p φ(W_e T⁻¹)
 
 W_e is the turn under which edge e fits, p the share of false edges, ρ the density of good edges' errors (Student's t),
-φ that of false ones, both as multiples of the density of random rotations. There is a peak at T = 1, the answer, and
-others near W_e. The integral over a peak is its height times its width, 1 / ρ(1) for one edge and m^-3/2 of that for m
+φ that of false ones, both as multiples of the density of random rotations. Of an edge that the user has accepted p φ
+is 0, and ρ is next to 0 where its error is not that of a good edge. There is a peak at T = 1, the answer, and others
+near W_e. The integral over a peak is its height times its width, 1 / ρ(1) for one edge and m^-3/2 of that for m
 that agree. What is left is the probability that all edges are false, p for each of them.
 """
 
@@ -112,15 +113,17 @@ class Attachment:
         component = parts.forest.component[node]
         stated = parts.stated(body_from_world)
         angle = rows.angle(stated[3])
-        here = _Peaks.of(density, angle, part, component).log_mass
-        none = np.bincount(part, minlength=len(node)) * np.log(density.false_share[component])
+        is_accepted = parts.is_accepted[parts.edge]
+        here = _Peaks.of(density, _Errors(angle, is_accepted), part, component).log_mass
+        false = np.where(is_accepted, -PRIORS.contradicted, np.log(density.false_share[component[part]]))
+        none = np.bincount(part, false, len(node))
         tries = np.flatnonzero(angle > NUMBERS.outlier_angle)
         found: list[tuple[_Peaks, np.ndarray, np.ndarray, np.ndarray]] = []
         present = np.maximum(here, none)
         most = present.copy()
         for one, which, other in parts.pairs(tries):
             between = rows.angle(np.einsum("ip,ip->p", stated[:, one[which]], stated[:, other]))
-            peaks = _Peaks.of(density, between, which, component[part[one]])
+            peaks = _Peaks.of(density, _Errors(between, is_accepted[other]), which, component[part[one]])
             np.maximum.at(most, part[one], peaks.log_mass)
             found.append((peaks, one, which, other))
         turns = _likeliest(node, part, stated, present, found)
@@ -180,6 +183,13 @@ def _likeliest(
     return turns
 
 
+class _Errors(NamedTuple):
+    """Errors ``(B,)`` rad of edges, and ``(B,)`` bool, which of these the user has accepted."""
+
+    angle: np.ndarray
+    is_accepted: np.ndarray
+
+
 class _Peaks(NamedTuple):
     """G peaks of parts' posteriors, with B errors of edges there.
 
@@ -194,10 +204,13 @@ class _Peaks(NamedTuple):
     agreeing: np.ndarray
 
     @classmethod
-    def of(cls, density: ErrorDensity, angle: np.ndarray, peak: np.ndarray, component: np.ndarray) -> _Peaks:
-        """From the errors ``(B,)`` rad at each ``peak`` ``(B,)``, and the peaks' components ``(G,)``."""
+    def of(cls, density: ErrorDensity, errors: _Errors, peak: np.ndarray, component: np.ndarray) -> _Peaks:
+        """From the errors at each ``peak`` ``(B,)``, and the peaks' components ``(G,)``."""
+        angle, is_accepted = errors
         good = density.log_good(angle, component[peak])
-        either = np.logaddexp(good, density.log_false(angle, component[peak]))
+        good -= PRIORS.contradicted * (is_accepted & (angle > NUMBERS.outlier_angle))
+        false = np.where(is_accepted, -np.inf, density.log_false(angle, component[peak]))
+        either = np.logaddexp(good, false)
         good = np.exp(good - either)
         agreeing = np.maximum(np.bincount(peak, good, len(component)), 1.0)
         height = density.log_good(np.zeros(len(component)), component) - np.log1p(-density.false_share[component])

@@ -22,6 +22,7 @@ from scipy.special import expit, log_expit
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianPattern
+from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.sfm.priors import ConsensusPriors
 
@@ -59,7 +60,7 @@ class Fitted:
     Attributes:
         body_from_world: ``(4, N)``.
         good: ``(M,)`` probability that each edge is good.
-        log_likelihood: nats, of all edges.
+        log_likelihood: nats, of all edges; less for trusted ones that are no good ones.
         scale: rad, scale s of good edges.
     """
 
@@ -133,11 +134,15 @@ def fitted(edges: Edges, body_from_world: np.ndarray, priors: ConsensusPriors) -
         log_good, log_false = density.logs(square, turned)
         log_false = np.where(edges.is_trusted, -np.inf, log_false)
         either = np.logaddexp(log_good, log_false)
-        good, log_likelihood = np.exp(log_good - either), float(either.sum())
+        is_contradicted = edges.is_trusted & (square > NUMBERS.outlier_angle**2)
+        good = np.exp(log_good - either)
+        log_likelihood = float(either.sum()) - priors.contradicted * int(is_contradicted.sum())
         if abs(log_likelihood - last) < priors.settled:
             break
         last = log_likelihood
         weight = density.maximise(good, square, turned)
+        # However far off a trusted edge is, it weighs as one that errs by the scale about each axis.
+        weight = np.where(edges.is_trusted, np.maximum(weight, density.scale**-2), weight)
         # The floor keeps the system solvable where a node has only false edges.
         floor = 1e-9 * float(weight.max())
         step = edges.pattern.factorize(np.maximum(weight, floor)).fit(residual.T)

@@ -108,16 +108,15 @@ def _searched(edges: Edges, answer: Tensor, priors: ConsensusPriors) -> Fitted |
     graph = ViewGraph.create(edges.source, edges.target, edges.measured.T, num_nodes=edges.num_nodes)
     triangles = Triangles.of(graph, priors.max_triangles)
     first = fitted(edges, np.ascontiguousarray(answer.numpy().T), priors)
-    others = [
-        fitted(edges, _along_tree(graph, triangles.votes(closing, graph.num_edges)), priors)
-        for closing in priors.closing
-    ]
+    is_trusted = torch.from_numpy(edges.is_trusted)
+    votes = (triangles.votes(closing, graph.num_edges) for closing in priors.closing)
+    others = [fitted(edges, _along_tree(graph, of.masked_fill(is_trusted, torch.inf)), priors) for of in votes]
     best = max(others, key=lambda other: other.log_likelihood)
     return best if best.log_likelihood > first.log_likelihood + priors.ahead else None
 
 
 def _along_tree(graph: ViewGraph, votes: Tensor) -> np.ndarray:
-    """Orientations ``(4, n)`` along the tree of the edges with most ``votes`` ``(m,)``."""
+    """Orientations ``(4, n)`` along the tree of the edges with most ``votes`` ``(m,)``, which may be infinite."""
     forest = minimum_spanning_forest(graph, 1 / (_NO_VOTE + votes))
     return np.ascontiguousarray(compose_orientations(forest, graph).numpy().T)
 

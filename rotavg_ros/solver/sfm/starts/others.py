@@ -18,7 +18,7 @@ from rotavg_ros.solver.sfm.refinement import PRIORS, coarse_steps
 from rotavg_ros.solver.sfm.starts.choice import Start
 from rotavg_ros.solver.sfm.starts.spectral import spectral
 from rotavg_ros.solver.sfm.step import Problem, Structure
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 
 def is_sparse(graph: ViewGraph, component: Tensor) -> Tensor:
@@ -64,13 +64,13 @@ def _by_all_alike(graph: ViewGraph, component: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _part(graph: ViewGraph, parent_edge: Tensor) -> Tensor:
-    """Indices of edges, at most half of ``sparse_degree`` per source, evenly spread, and those of the forest."""
+    """Indices of edges: at most half of ``sparse_degree`` per source, evenly spread; the forest's; accepted ones."""
     number = torch.arange(graph.num_edges, device=graph.device)
     count = torch.bincount(graph.source, minlength=graph.num_nodes)
     # The rank of an edge among those with its source; a canonical form is sorted by source.
     rank = number - (count.cumsum(0) - count)[graph.source]
     most, of = PRIORS.starts.sparse_degree // 2, count[graph.source]
     is_chosen = (rank + 1) * most // of > rank * most // of
-    is_chosen |= of <= most
+    is_chosen |= (of <= most) | (graph.label == EdgeLabel.ACCEPTED)
     is_chosen[parent_edge[parent_edge >= 0]] = True
     return is_chosen.nonzero()[:, 0]

@@ -24,10 +24,12 @@ from rotavg_ros.solver.algebra.pointer_jumping import doublings, follow, lowest_
 from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root, minimum_spanning_forest
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.priors import RefinementPriors
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # Number of pairs of statements that are compared at a time; bounds the memory.
 _AT_A_TIME = 1 << 20
+# Cost, in rad^½, of an accepted edge that is no good one: more than that of all edges that join a part.
+_CONTRADICTED = 100.0
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,7 @@ class Parts:
         source, target: ``(M,)``.
         measured: ``(4, M)`` target_from_source.
         weight: ``(M,)`` w of the cost.
+        is_accepted: ``(M,)`` bool, edges that the user has accepted.
         forest: the tree of each component.
         level: ``(N,)`` int, number of the tree's edges between each node and its root.
         size: ``(N,)`` number of nodes of the branch below each node, itself included.
@@ -85,6 +88,7 @@ class Parts:
     target: np.ndarray
     measured: np.ndarray
     weight: np.ndarray
+    is_accepted: np.ndarray
     forest: SpanningForest
     level: np.ndarray
     size: np.ndarray
@@ -110,22 +114,29 @@ class Parts:
         size = sums_of_branches(forest.parent, level, np.ones(graph.num_nodes))
         used = np.flatnonzero(is_used)
         node, edge, inside = _joining(forest, level, source[used], target[used], priors.starts.part_edges)
-        return cls(source, target, measured, weights, forest, level, size, node, used[edge], inside)
+        is_accepted = (graph.label == EdgeLabel.ACCEPTED).numpy()
+        return cls(source, target, measured, weights, is_accepted, forest, level, size, node, used[edge], inside)
 
     def turns(self, body_from_world: np.ndarray) -> Turns:
         """The best turn of each branch, given orientations ``(4, N)``."""
         node, branch = np.unique(self.node, return_inverse=True)
         stated = self.stated(body_from_world)
-        weight, angle = self.weight[self.edge], rows.angle(stated[3])
+        every, angle = np.arange(len(self.edge)), rows.angle(stated[3])
         tries = np.flatnonzero(angle > NUMBERS.outlier_angle)
         cost = np.empty(len(tries))
         begin = 0
         for one, which, other in self.pairs(tries):
             cosine = np.einsum("ip,ip->p", stated[:, one[which]], stated[:, other])
-            cost[begin : begin + len(one)] = np.bincount(which, weight[other] * np.sqrt(rows.angle(cosine)), len(one))
+            cost[begin : begin + len(one)] = np.bincount(which, self._costs(other, rows.angle(cosine)), len(one))
             begin += len(one)
-        cost -= np.bincount(branch, weight * np.sqrt(angle), len(node))[branch[tries]]
+        cost -= np.bincount(branch, self._costs(every, angle), len(node))[branch[tries]]
         return Turns.least(node, branch, tries, cost, stated)
+
+    def _costs(self, chosen: np.ndarray, angle: np.ndarray) -> np.ndarray:
+        """Cost w |r|^½ of some of the P edges, with residuals in rad; accepted ones have to be good."""
+        edge = self.edge[chosen]
+        is_contradicted = self.is_accepted[edge] & (angle > NUMBERS.outlier_angle)
+        return np.asarray(self.weight[edge] * (np.sqrt(angle) + _CONTRADICTED * is_contradicted))
 
     def pairs(self, chosen: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Some of the P edges, each beside all edges that join the same branch; some millions of pairs at a time.

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros import ViewGraph, solve
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.metrics import orientation_errors
+from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.sfm.consensus.search import CONSENSUS, consensus
 from rotavg_ros.view_graph import EdgeLabel
 
@@ -104,15 +105,19 @@ def test_components_are_judged_by_themselves() -> None:
 
 
 def test_labels_count() -> None:
-    """What a user accepts is good."""
-    graph, _ = _scans(4)
+    """What a user accepts is good: it weighs in full, and an answer that contradicts it is not taken."""
+    graph, truth = _scans(4)
     first = solve(graph, method=_WITHOUT, device="cpu").body_from_world
-    component = torch.zeros(graph.num_nodes, dtype=torch.int64)
-    beside = ((graph.target - graph.source) < 4).to(graph.label)
-    chained = replace(graph, label=torch.where(beside > 0, EdgeLabel.ACCEPTED, EdgeLabel.AUTOMATIC).to(graph.label))
-    found = consensus(chained, first, component, CONSENSUS)
-    assert found is not None and found.weight is not None
-    assert bool((found.weight[beside > 0] == 1).all())
+    error, residual = (torch.rad2deg(EdgeResiduals(graph, at.float()).angles()) for at in (truth, first))
+    beside = (graph.target - graph.source) < 4
+    for accepted in (beside & (error < 20), beside & (error > 20) & (residual < 20)):
+        label = torch.where(accepted, int(EdgeLabel.ACCEPTED), int(EdgeLabel.AUTOMATIC))
+        component = torch.zeros(graph.num_nodes, dtype=torch.int64)
+        found = consensus(replace(graph, label=label), first, component, CONSENSUS)
+        assert found is not None and found.body_from_world is not None and found.weight is not None
+        assert bool((found.weight[accepted] == 1).all())
+        found_residual = torch.rad2deg(EdgeResiduals(graph, found.body_from_world.float()).angles())
+        assert float(found_residual[accepted].max()) < 20
 
 
 def test_of_a_graph_that_is_too_large_it_is_said_that_there_may_be_another_answer() -> None:
