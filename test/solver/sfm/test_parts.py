@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +15,11 @@ from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.refinement import EdgeWeights
+from rotavg_ros.solver.sfm.starts import parts
 from rotavg_ros.solver.sfm.starts.choice import Start, begin, settle_best
 from rotavg_ros.solver.sfm.starts.parts import Parts
 from rotavg_ros.solver.sfm.step import Structure
-from test.solver.graphs import as_quaternions, random_truth
+from test.solver.graphs import as_quaternions, measured, random_truth
 
 PRIORS = RefinementPriors()
 # The second half as seen by the false edges between the halves.
@@ -145,3 +147,36 @@ def test_there_is_nothing_to_turn_in_a_graph_that_is_joined_well_or_hardly_at_al
         parts, rows = parts_at(graph, truth)
         assert parts.improved(rows, PRIORS) is None
         assert parts.rival(rows, PRIORS) is None
+
+
+def wheel(rim: int) -> tuple[ViewGraph, Rotation]:
+    """A ring, and a camera that has seen everything."""
+    truth, around = random_truth(rim + 1, 0), np.arange(rim)
+    return measured(truth, np.tile(around, 2), np.concatenate(((around + 1) % rim, np.full(rim, rim)))), truth
+
+
+def test_a_camera_that_has_seen_everything_takes_memory_for_its_edges_alone() -> None:
+    """Not for their square: 3000² numbers of 4 bytes are 36 MB."""
+    graph, truth = wheel(3000)
+    parts_at(*wheel(30))
+    tracemalloc.start()
+    parts_at(graph, truth)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 18e6
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_common_neighbours_are_paths_of_two_edges(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Entries of the squared adjacency, beside hubs and parallel edges as well."""
+    monkeypatch.setattr(parts, "_AT_A_TIME", 50)
+    rng = np.random.default_rng(seed)
+    source, target = np.sort(
+        np.concatenate((rng.integers(0, 60, (200, 2)), rng.integers(0, [3, 60], (150, 2)))), axis=1
+    ).T
+    source, target = source[source < target], target[source < target]
+    adjacency = np.zeros((60, 60))
+    np.add.at(adjacency, (source, target), 1)
+    adjacency += adjacency.T
+    expected = (adjacency @ adjacency)[source, target]
+    np.testing.assert_array_equal(parts._common_neighbours(60, source, target), expected)

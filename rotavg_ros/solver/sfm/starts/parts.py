@@ -26,10 +26,13 @@ from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-# Number of pairs of statements that are compared at a time; bounds the memory.
+# Number of pairs of statements, or of neighbours, that are compared at a time; bounds the memory.
 _AT_A_TIME = 1 << 20
 # Cost, in rad^½, of an accepted edge that is no good one: more than that of all edges that join a part.
 _CONTRADICTED = 100.0
+# Where an end of an edge has this many times as many neighbours as the other, looking these up among them is faster
+# than going through both lists: 50 ns a neighbour against 6 (one core of 2020). No answer depends on it.
+_UNEVEN = 8
 
 
 @dataclass(frozen=True)
@@ -212,12 +215,38 @@ def _tree(graph: ViewGraph, fits: np.ndarray, degree: int) -> SpanningForest:
     few = evenly_spread(graph.source, graph.num_nodes, degree).numpy()
     few = few[fits[few]]
     source, target = graph.source.numpy()[few], graph.target.numpy()[few]
-    ends = np.concatenate((source, target)), np.concatenate((target, source))
-    adjacency = csr_array((np.ones(len(ends[0]), dtype=np.int32), ends), (graph.num_nodes, graph.num_nodes))
-    common = adjacency[source].multiply(adjacency[target]).sum(axis=1)
     cost = np.where(fits, 2.0, 3.0)
-    cost[few] = 1 / (1 + np.asarray(common).ravel())
+    cost[few] = 1 / (1 + _common_neighbours(graph.num_nodes, source, target))
     return minimum_spanning_forest(graph, torch.from_numpy(cost))
+
+
+def _common_neighbours(num_nodes: int, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Number ``(K,)`` of paths of two edges between each edge's ends; time and memory are of the shorter lists."""
+    ends = np.concatenate((source, target)), np.concatenate((target, source))
+    adjacency = csr_array((np.ones(len(ends[0]), dtype=np.int32), ends), (num_nodes, num_nodes))
+    adjacency.sort_indices()
+    degree = np.diff(adjacency.indptr)
+    is_shorter = degree[source] <= degree[target]
+    short, long = np.where(is_shorter, source, target), np.where(is_shorter, target, source)
+    # Going through both lists is faster, but each edge of a hub would go through all the others.
+    is_uneven = degree[long] > _UNEVEN * degree[short]
+    common = np.empty(len(source))
+    common[~is_uneven] = adjacency[short[~is_uneven]].multiply(adjacency[long[~is_uneven]]).sum(axis=1)
+    common[is_uneven] = _looked_up(adjacency, short[is_uneven], long[is_uneven])
+    return common
+
+
+def _looked_up(adjacency: csr_array, short: np.ndarray, long: np.ndarray) -> np.ndarray:
+    """Number ``(K,)`` of paths of two edges, by looking the neighbours of ``short`` up among those of ``long``."""
+    size, first = np.diff(adjacency.indptr)[short], adjacency.indptr[short]
+    common = np.empty(len(short))
+    for begin, end in pairwise(_bounds(size)):
+        of = size[begin:end]
+        which = np.repeat(np.arange(len(of)), of)
+        place = np.arange(len(which)) + np.repeat(first[begin:end] - np.cumsum(of) + of, of)
+        found = np.asarray(adjacency[long[begin:end][which], adjacency.indices[place]]).ravel()
+        common[begin:end] = np.bincount(which, found * adjacency.data[place], len(of))
+    return common
 
 
 def _joining(
