@@ -130,7 +130,7 @@ def _form(graph: ViewGraph, component: Tensor, own_axes: bool) -> tuple[Canonica
         high[part] = stated.higher(chosen)
         edge.index_copy_(0, chosen.long(), place[part])
         upwards = stated.upwards(chosen)
-        measured[part] = _turned(upwards, axes, component, low[part]) if own_axes else upwards
+        measured[part] = _of_one_sign(_turned(upwards, axes, component, low[part]) if own_axes else upwards)
 
     for_each(write, slices(len(low), SLICE_EDGES, low.device))
     # One number each, expanded to M rows: with millions of edges, columns that nobody reads would take much memory.
@@ -203,9 +203,7 @@ def _without_copies(graph: ViewGraph) -> tuple[Tensor, Tensor]:
     is_forward = (graph.source < graph.target)[:, None]
     number = (graph.target_from_source / _SAME).round().long()
     number[:, :3] *= torch.where(is_forward, 1, -1)
-    # Half turns have two quaternions.
-    leading = number[:, :3].sign() * torch.tensor([4, 2, 1], device=number.device)
-    number = torch.where(((number[:, 3] == 0) & (leading.sum(dim=1) < 0))[:, None], -number, number)
+    number = torch.where(((number[:, 3] == 0) & _is_negative(number))[:, None], -number, number)
     low, high = torch.minimum(graph.source, graph.target), torch.maximum(graph.source, graph.target)
     content = torch.cat((torch.stack((low, high, graph.label), dim=1), number), dim=1)
     _, group = torch.unique(content, dim=0, return_inverse=True)
@@ -213,6 +211,21 @@ def _without_copies(graph: ViewGraph) -> tuple[Tensor, Tensor]:
     first = torch.full_like(every, graph.num_edges).scatter_reduce(0, group, every, "amin")[group]
     is_kept = first == every
     return is_kept.nonzero().squeeze(1), (is_kept.cumsum(0) - 1)[first]
+
+
+def _is_negative(number: Tensor) -> Tensor:
+    """``(K,)`` whether the first of x, y, z that is not zero is negative, of quaternions ``(K, 4)`` in whole units."""
+    return (number[:, :3].sign() * number.new_tensor([4, 2, 1])).sum(dim=1) < 0
+
+
+def _of_one_sign(measured: Tensor) -> Tensor:
+    """Quaternions ``(K, 4)`` in canonical axes; half turns get the sign that makes the first entry positive."""
+    half_turn = (measured[:, 3].abs() < _SAME).nonzero().squeeze(1)
+    if len(half_turn):
+        chosen = measured[half_turn]
+        is_negative = _is_negative((chosen / _SAME).round())
+        measured[half_turn] = torch.where(is_negative[:, None], -chosen, chosen)
+    return measured
 
 
 def _stating_the_highest(graph: ViewGraph, kept: Tensor, copy_of: Tensor) -> ViewGraph:
@@ -300,7 +313,8 @@ def _axes(source: Tensor, target: Tensor, rows: Tensor, component: Tensor) -> Te
     moment = _moments(before, of_edge, count) + _moments(after, of_edge, count)
     in_plane = torch.linalg.eigh(moment).eigenvectors[:, :, 1]
     axes = torch.stack(((main[:, :, :2] @ in_plane[:, :, None]).squeeze(2), main[:, :, 2]), dim=1)
-    arriving = rows.new_zeros(3, len(component)).index_add_(1, target, rows[:3]).index_add_(1, source, -rows[:3])
+    directed = rows[:3] * (rows[3] >= _SAME)  # half turns point either way
+    arriving = rows.new_zeros(3, len(component)).index_add_(1, target, directed).index_add_(1, source, -directed)
     skew = _sums((arriving * arriving).sum(dim=0) * arriving, component, count)
     axes = torch.where(axes @ skew[:, :, None] < 0, -axes, axes)
     return torch.cat((axes, torch.linalg.cross(axes[:, :1], axes[:, 1:])), dim=1)

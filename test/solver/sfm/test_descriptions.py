@@ -1,4 +1,4 @@
-"""What describes a graph of photos without saying anything of it: cameras' axes, names, order, directions, copies."""
+"""What describes a graph of photos without saying anything of it: axes, names, order, directions, copies, signs."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
 from rotavg_ros import Solution, ViewGraph, rotations, solve
@@ -203,6 +205,40 @@ def test_only_copies_with_the_same_label_are_one() -> None:
     assert form.graph.num_edges == 4  # the first two are one half turn
     assert form.edge[0] == form.edge[1]
     assert len(set(form.edge.tolist())) == 4
+
+
+def _with_half_turns(graph: ViewGraph, share: float) -> ViewGraph:
+    """A share of the edges states half turns about any axes."""
+    rng = np.random.default_rng(9)
+    chosen = torch.from_numpy(rng.random(graph.num_edges) < share)
+    axis = torch.from_numpy(rng.standard_normal((graph.num_edges, 3)))
+    half_turn = torch.cat((axis / axis.norm(dim=1, keepdim=True), torch.zeros(graph.num_edges, 1)), dim=1)
+    return replace(graph, target_from_source=torch.where(chosen[:, None], half_turn, graph.target_from_source))
+
+
+def _with_other_signs(graph: ViewGraph, seed: int) -> ViewGraph:
+    """Some of the half turns by their other quaternions."""
+    is_other = torch.from_numpy(np.random.default_rng(seed).random(graph.num_edges) < 0.5)
+    is_other &= graph.target_from_source[:, 3] == 0
+    measured = torch.where(is_other[:, None], -graph.target_from_source, graph.target_from_source)
+    return replace(graph, target_from_source=measured)
+
+
+@settings(max_examples=20)
+@given(share=st.sampled_from([0.02, 0.3, 1.0]), seed=st.integers(0, 2**16), own_axes=st.booleans())
+def test_half_turns_have_one_form(share: float, seed: int, own_axes: bool) -> None:
+    graph = _with_half_turns(SAMPLES["complete"].graph, share)
+    expected, found = (CanonicalForm.of(one, own_axes=own_axes) for one in (graph, _with_other_signs(graph, seed)))
+    assert torch.equal(found.node, expected.node) and torch.equal(found.edge, expected.edge)
+    assert torch.equal(found.graph.target_from_source, expected.graph.target_from_source)
+
+
+@pytest.mark.parametrize("method", ["neurora", "neurora-v1", "neurora-paper"])
+def test_which_of_its_quaternions_a_half_turn_has_does_not_matter(method: str) -> None:
+    graph = _with_half_turns(SAMPLES["paper"].graph, 0.3)
+    expected, found = (_solved(one, method) for one in (graph, _with_other_signs(graph, 1)))
+    assert _furthest_deg(found.body_from_world, expected.body_from_world) < 1e-6
+    torch.testing.assert_close(found.outlier_score, expected.outlier_score)
 
 
 def test_a_form_and_back_is_the_graph() -> None:
