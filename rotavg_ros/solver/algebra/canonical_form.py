@@ -6,7 +6,7 @@ carry no information about the orientations. The canonical form chooses them by 
 - Of edges that state the same rotation between the same nodes, one is kept, with the highest precision stated.
 - Nodes are sorted by a weighted number of walks: k_v = Σ_u (½ + w_uv) k_u, iterated a few times from k = 1. w_uv is the
   cosine of half an edge's angle, which none of those choices changes.
-- Edges run from the earlier node to the later one and are sorted by both.
+- Edges run from the earlier node to the later one and are sorted by both, parallel ones by w, x, y and z.
 - Cameras' axes: those of the second moment Σ s sᵀ of all edges, where s is x, y, z of an edge's quaternion. Turning the
   cameras' axes by A, R̃_uv → A R̃_uv A⁻¹, turns every s by A, and so the moment's axes. y has the largest moment, z the
   least. An axis is directed so that Σ_v |b_v|² b_v has a positive component along it, where b_v = Σ_u s_uv over the
@@ -77,9 +77,11 @@ class CanonicalForm:
         # Different rotations between the same nodes are sorted by their angles; the sorting by nodes keeps this order.
         by_angle = graph.target_from_source[kept, 3].argsort(stable=True)
         form, _ = _form(graph.select_edges(kept[by_angle]), component, own_axes)
-        place = torch.empty_like(form.edge)
-        place[by_angle] = form.edge
-        return replace(form, edge=place[copy_of])
+        order = _parallels_in_order(form.graph)
+        moved, place = torch.empty_like(form.edge), torch.empty_like(form.edge)
+        moved[order] = torch.arange(len(order), dtype=moved.dtype, device=moved.device)
+        place[by_angle] = moved[form.edge]
+        return replace(form, graph=form.graph.select_edges(order), edge=place[copy_of])
 
     def first_nodes(self) -> Tensor:
         """``(C,)`` the canonical node of the first node of each component of the given graph."""
@@ -211,6 +213,27 @@ def _without_copies(graph: ViewGraph) -> tuple[Tensor, Tensor]:
     first = torch.full_like(every, graph.num_edges).scatter_reduce(0, group, every, "amin")[group]
     is_kept = first == every
     return is_kept.nonzero().squeeze(1), (is_kept.cumsum(0) - 1)[first]
+
+
+def _parallels_in_order(graph: ViewGraph) -> Tensor:
+    """Indices ``(M,)`` by which edges between the same nodes are sorted: by w, x, y, z and label.
+
+    Args:
+        graph: sorted by nodes, in canonical axes.
+    """
+    is_next = (graph.source[1:] == graph.source[:-1]) & (graph.target[1:] == graph.target[:-1])
+    none = is_next.new_zeros(1)
+    is_second = torch.cat((none, is_next))
+    parallel = (is_second | torch.cat((is_next, none))).nonzero().squeeze(1)
+    pair = (~is_second).cumsum(0)[parallel]
+    number = (graph.target_from_source[parallel] / _SAME).round().long()
+    order = torch.arange(len(parallel), device=parallel.device)
+    # By what counts least first, since the sorting is stable.
+    for key in (graph.label[parallel], *(number[:, entry] for entry in (2, 1, 0, 3)), pair):
+        order = order[key[order].argsort(stable=True)]
+    every = torch.arange(graph.num_edges, device=parallel.device)
+    every[parallel] = parallel[order]
+    return every
 
 
 def _is_negative(number: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from rotavg_ros import Solution, ViewGraph, rotations, solve
@@ -21,6 +22,7 @@ from rotavg_ros.solver import METHODS
 from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
 from rotavg_ros.solver.sfm.options import PAPER_PARTS
 from rotavg_ros.view_graph import EdgeLabel
+from test.solver.graphs import random_truth
 
 NETWORK_METHODS = ("neurora", "neurora-v1", "neurora-v2", "cleannet-spt", "spt-finenet", "spt", "neurora-round")
 # The paper's networks know the cameras' axes that they were trained in; all the rest must not matter to them, either.
@@ -181,6 +183,23 @@ def test_the_gauge_of_a_start_does_not_matter(method: str) -> None:
         for begun in (start, rotations.multiply(start, gauge))
     ]
     assert _furthest_deg(answers[1], answers[0]) < 1e-3
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_order_of_edges_between_the_same_cameras_does_not_matter(seed: int) -> None:
+    """Not even of those that turn by the same angle."""
+    rng = np.random.default_rng(seed)
+    pairs = np.repeat(np.stack(np.triu_indices(12, k=1))[:, rng.random(66) < 0.5], 3, axis=1)
+    truth, axis = random_truth(12, seed), rng.standard_normal((pairs.shape[1], 3))
+    quarter = Rotation.from_rotvec(np.pi / 2 * axis / np.linalg.norm(axis, axis=1)[:, None]).as_quat()
+    noise = Rotation.from_rotvec(0.03 * rng.standard_normal((len(axis), 3)))
+    stated = noise * truth[pairs[1]] * truth[pairs[0]].inv()
+    stated = np.where(rng.random(len(axis))[:, None] < 0.5, quarter, stated.as_quat())
+    graph = ViewGraph.create(*pairs, stated)
+    described = _shuffled(graph, rng)
+    expected, found = (_solved(one, "neurora") for one in (graph, described.graph))
+    assert _furthest_deg(found.body_from_world, expected.body_from_world) < 1e-4
+    torch.testing.assert_close(found.outlier_score[described.edge], expected.outlier_score, atol=1e-5, rtol=0)
 
 
 def test_copies_count_once_and_all_have_a_verdict() -> None:

@@ -6,9 +6,10 @@ good (Student's t of scale s in three dimensions) over that of uniform rotations
 
     P(angle | g_e = 1) / P(angle | g_e = 0) = 1 − q + q λ,     q = P(g_c = 1) P(g_d = 1).
 
-Two triangles of an edge have no other edge in common, so their log ratios add up, to E_e. P(g_c) follows from all
-triangles of c but this one: messages are passed (sum-product, Pearl 1988; for loops of view-graphs Zach, Klopschitz and
-Pollefeys, CVPR 2010) for a few rounds, although triangles of four cameras share edges. The prior is
+Two triangles of an edge have no other edge in common (of parallel edges, one at most), so their log ratios add up, to
+E_e. P(g_c) follows from all triangles of c but this one: messages are passed (sum-product, Pearl 1988; for loops of
+view-graphs Zach, Klopschitz and Pollefeys, CVPR 2010) for a few rounds, although triangles of four cameras share edges.
+The prior is
 
     logit P(g_e = 0) = b + k ℓ_e,     ℓ: CleanNet's log-odds;
 

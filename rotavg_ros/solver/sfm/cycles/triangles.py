@@ -13,6 +13,8 @@ from rotavg_ros.view_graph import ViewGraph
 
 # Number of paths that a thread examines at a time.
 _SLICE_PATHS = 8192
+# Largest number of parallel edges that close a path, evenly spread over all; bounds the number of triangles.
+_MOST_CLOSING = 8
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ class Triangles:
 
         Args:
             graph: M edges.
-            most: maximum number of two-edge paths that are examined, evenly spread, and so of triangles.
+            most: maximum number of two-edge paths that are examined, evenly spread, and so of triangles; parallel edges
+                may close a path several times, up to eight.
             among: ``(M,)`` bool: only triangles with at least one of these edges; default: all.
             component: ``(N,)`` component of every node; ``most`` is then ``(C,)``, per component.
             run: number of consecutive paths examined together (the last run may exceed ``most``): this gives many
@@ -71,9 +74,7 @@ class Triangles:
             along = path[parts[number]]
             one = torch.searchsorted(up_to, along, right=True)
             two = first[target[one]] + along - (up_to[one] - count[one])
-            wanted = source[one] * graph.num_nodes + target[two]
-            three = torch.searchsorted(key, wanted).clamp(max=max(graph.num_edges - 1, 0))
-            edge = torch.stack((one, two, three))[:, key[three] == wanted]
+            edge = torch.stack(_closed(one, two, key, source[one] * graph.num_nodes + target[two]))
             edge = edge if order is None else order[edge]
             edge = edge if among is None else edge[:, among[edge].any(dim=0)]
             measured = [graph.target_from_source[each].double() for each in edge]
@@ -111,6 +112,25 @@ class Triangles:
         )
         by_chance = near.double() / 27
         return (nearest - by_chance) / (by_chance + 1).sqrt()
+
+
+def _closed(one: Tensor, two: Tensor, key: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Paths of edges ``one`` and ``two`` ``(P,)``, each with every edge that closes it, ``(T,)``.
+
+    Args:
+        key: ``(M,)`` sorted, one number for both ends of each edge.
+        wanted: ``(P,)`` that of the edges that close each path.
+    """
+    begin = torch.searchsorted(key, wanted)
+    is_closed = key[begin.clamp(max=len(key) - 1)] == wanted
+    one, two, begin, wanted = (value[is_closed] for value in (one, two, begin, wanted))
+    parallel = torch.searchsorted(key, wanted, right=True) - begin
+    taken = parallel.clamp(max=_MOST_CLOSING)
+    if bool((taken == 1).all()):
+        return one, two, begin
+    path = torch.arange(len(one), device=one.device).repeat_interleave(taken)
+    rank = torch.arange(len(path), device=one.device) - (taken.cumsum(0) - taken)[path]
+    return one[path], two[path], begin[path] + rank * parallel[path] // taken[path]
 
 
 def _spread(count: Tensor, up_to: Tensor, group: Tensor, most: Tensor, run: int) -> Tensor:

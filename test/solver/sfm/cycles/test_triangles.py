@@ -1,10 +1,13 @@
-"""Which triangles are looked at where there are many."""
+"""Which triangles are looked at where there are many, and where edges are parallel."""
 
 from __future__ import annotations
+
+from itertools import permutations
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from rotavg_ros import ViewGraph
 from rotavg_ros.solver.sfm.cycles.triangles import Triangles
@@ -48,3 +51,29 @@ def test_runs_have_many_triangles_of_few_edges() -> None:
     assert len(runs.edge[0].unique()) < 0.2 * len(spread.edge[0].unique())
     for run in (1, 7, 10**9):
         assert len(Triangles.of(graph, 10**6, run=run).angle) == 60 * 59 * 58 / 6
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_each_of_several_edges_between_two_cameras_closes_triangles(seed: int) -> None:
+    """Against all triples of edges."""
+    rng = np.random.default_rng(seed)
+    pairs = np.concatenate(np.triu_indices(6, k=1)).reshape(2, -1)
+    source, target = pairs[:, np.sort(rng.integers(0, pairs.shape[1], 40))]
+    graph = measured(random_truth(6, seed), source, target, Rotation.random(40, rng))
+    found = Triangles.of(graph, 10**6)
+    expected = {
+        (one, two, three)
+        for one, two, three in permutations(range(40), 3)
+        if target[one] == source[two] and (source[one], target[two]) == (source[three], target[three])
+    }
+    assert len(found.angle) == len(expected)
+    assert {tuple(edge) for edge in found.edge.T.tolist()} == expected
+
+
+def test_of_very_many_parallel_edges_some_close_each_path() -> None:
+    """Eight of sixty-four, evenly spread."""
+    source, target = np.concatenate(([[0], [1]], [[1], [2]], np.tile([[0], [2]], 64)), axis=1)
+    found = Triangles.of(measured(random_truth(3, 0), source, target), 10**6)
+    order = np.argsort(3 * source + target, kind="stable")
+    closing = np.flatnonzero((source[order] == 0) & (target[order] == 2))
+    assert found.edge[2].tolist() == order[closing[::8]].tolist()
