@@ -72,7 +72,7 @@ class Measure(NamedTuple):
         shape: shape of the noise.
         variance: ``(N,)`` variances of the nodes, in units of the shape; without numerical floors.
         weigh: function (expected squared residuals of edges, which edges these are) → robust weights.
-        dtype: precision in which residuals and systems are computed.
+        dtype: precision in which residuals and systems are computed where graphs are well knit; elsewhere it is double.
         source_share: ``(M,)`` probability that each edge's noise is in its source's frame; None: from residuals.
         unit: ``(6, M)`` entries of T in the world's frame: residuals r count as T r (``stated/shape.py``), and the
             noise's shape is that of T r; None: T = 1.
@@ -167,6 +167,11 @@ class Step(NamedTuple):
     weight: Tensor
     decrement: Tensor
     source_share: Tensor
+
+    def only(self, chosen: Tensor, component: Tensor) -> Step:
+        """The same, but no turn where components ``(C,)`` are not chosen."""
+        turn = torch.where(chosen[component], self.turn, 0.0)
+        return self._replace(turn=turn, decrement=torch.where(chosen, self.decrement, 0.0))
 
 
 class Pull(NamedTuple):
@@ -327,29 +332,38 @@ class Problem:
 
     def step(self, orientations: Tensor, measure: Measure, prior: Tensor, is_open: Tensor) -> Step:
         """The least-squares step of the open components ``(C,)``; it is zero in the others."""
-        weights, matrix, force = self._pull(orientations, measure, self._believing(orientations, measure, prior))
+        prior = self._believing(orientations, measure, prior)
+        if self.is_well_knit:
+            step, is_solved = self._solved(orientations, measure, prior, is_open)
+            self.is_well_knit = bool(is_solved.all())
+        if not self.is_well_knit:
+            # Along a ring of thousands of cameras rounding to single precision exceeds what is to be solved for.
+            exact = measure._replace(dtype=torch.float64)
+            step, is_solved = self._solved(orientations, exact, prior, is_open)
+            step = step.only(is_solved, self.component)
+        return step
+
+    def _solved(self, orientations: Tensor, measure: Measure, prior: Tensor, is_open: Tensor) -> tuple[Step, Tensor]:
+        """The step as it is found, and the components ``(C,)`` in which it is as good as asked for."""
+        weights, matrix, force = self._pull(orientations, measure, prior)
         force *= is_open[self.component]
         system: Laplacian
         if matrix is None:
             system = BlockLaplacian(self.arrivals, weights, measure.shape, self.component)
         else:
             system = EdgeLaplacian(self.arrivals, MatrixWeights(matrix, weights.total), self.component)
-        tolerances = self.priors.least_angle, self.priors.step_tolerance
-        turn, is_solved = force, False
         if self.is_well_knit:
-            turn, is_solved = system.solve(force, system.diagonal_solve(), *tolerances)
-            self.is_well_knit = is_solved
-        if not is_solved:
-            if matrix is None:
-                # Cameras of a component share their noise's shape, and rotating it leaves its trace unchanged.
-                trace = measure.shape.information.diagonal().sum(dim=1)[self.graph.source]
-                approximate = factorised(self.graph, weights.total * trace / 3, self.roots)
-            else:
-                approximate = factorised(self.graph, matrix[[0, 3, 5]].mean(dim=0), self.roots)
-            turn, _ = system.solve(force, approximate, *tolerances)
+            approximate = system.diagonal_solve()
+        elif matrix is None:
+            # Cameras of a component share their noise's shape, and rotating it leaves its trace unchanged.
+            trace = measure.shape.information.diagonal().sum(dim=1)[self.graph.source]
+            approximate = factorised(self.graph, weights.total * trace / 3, self.roots)
+        else:
+            approximate = factorised(self.graph, matrix[[0, 3, 5]].mean(dim=0), self.roots)
+        turn, is_solved = system.solve(force, approximate, self.priors.least_angle, self.priors.step_tolerance)
         decrement = (force * turn).sum(dim=0).double()
         turn = (turn - turn[:, self.roots[self.component]]).double()
-        return Step(turn, system.weight_sum.double(), self.sum(decrement), weights.source_share)
+        return Step(turn, system.weight_sum.double(), self.sum(decrement), weights.source_share), is_solved
 
     def _pull(self, orientations: Tensor, measure: Measure, prior: Tensor) -> Pull:
         graph, dtype = self.graph, measure.dtype

@@ -44,8 +44,8 @@ def conjugate_gradients(
     right_hand_side: Tensor,
     systems: Systems,
     stop: Stop,
-) -> tuple[Tensor, bool]:
-    """``L⁻¹ b``, and whether it meets the tolerance.
+) -> tuple[Tensor, Tensor]:
+    """``L⁻¹ b``, and which systems ``(S,)`` meet the tolerance; numbers that are not finite do not.
 
     Args:
         product, precondition: ``L x`` and ``M⁻¹ x`` of vectors like ``b``; L positive semidefinite, M near L.
@@ -60,7 +60,7 @@ def conjugate_gradients(
         stop_if_abandoned()
         is_open = largest > goal
         if not bool(is_open.any()):
-            return solution, True
+            break
         image = product(direction)
         # A system that is solved to the last bit has no curvature: it would be 0/0.
         curvature = systems.dot(direction, image)
@@ -72,4 +72,4 @@ def conjugate_gradients(
         previous, energy = energy, systems.dot(residual, scaled)
         ratio = systems.spread(torch.where(previous > 0, energy / previous, 0.0))
         direction = torch.addcmul(scaled, ratio, direction)
-    return solution, not bool((largest > goal).any())
+    return solution, largest <= goal

@@ -120,8 +120,8 @@ class Laplacian(ABC):
 
     def solve(
         self, force: Tensor, precondition: Preconditioner, tolerance: float, relative_tolerance: float
-    ) -> tuple[Tensor, bool]:
-        """``L⁻¹ force`` ``(3, N)``, up to a constant in every component, and whether it is as good as asked for.
+    ) -> tuple[Tensor, Tensor]:
+        """``L⁻¹ force`` ``(3, N)``, up to a constant in every component, and where it is as good as asked for ``(C,)``.
 
         Args:
             force: sums to zero over every component.

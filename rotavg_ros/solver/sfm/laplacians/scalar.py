@@ -37,7 +37,8 @@ class ScalarLaplacian:
         # An isolated node has no force.
         degree = torch.where(self._degree > 0, self._degree, 1.0)
         stop = Stop(0.0, _SOLVED, MAX_ITERATIONS)
-        return conjugate_gradients(self._product, lambda x: x / degree, force, self._components, stop)
+        solution, is_solved = conjugate_gradients(self._product, lambda x: x / degree, force, self._components, stop)
+        return solution, bool(is_solved.all())
 
     def _product(self, x: Tensor) -> Tensor:
         return self._degree * x - arriving(self._adjacency, x)
