@@ -329,7 +329,7 @@ class Witnesses:
 
 
 def by_all_else(pose: PoseMode, price: float) -> Jump | None:
-    """The segment that is likeliest to have jumped by what all other rows predict of it; None if nothing could.
+    """The segment that is likeliest to have jumped by what all other rows predict of it; None if none gains by that.
 
     Odometry beside the chain holds places together across a jump: then all closures fit, and nothing is to be moved.
 
@@ -350,6 +350,8 @@ def by_all_else(pose: PoseMode, price: float) -> Jump | None:
     jumped = total + problem.could_jump[could, None, None] * free @ free.transpose(0, 2, 1)
     gained = _log_normal(off, jumped) - _log_normal(off, total) - price
     best = int(np.argmax(gained))
+    if gained[best] < 0:  # no labels change, so there is nothing that the prediction leaves out
+        return None
     nowhere, none = np.zeros(problem.drawn.num_nodes, dtype=bool), np.zeros(len(problem.closures), dtype=bool)
     return Jump(int(could[best]), -1, nowhere, np.zeros(3), float(gained[best]), none)
 
