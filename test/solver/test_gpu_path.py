@@ -37,9 +37,9 @@ def _forget(traffic: Traffic) -> None:
 @pytest.mark.parametrize(
     ("method", "waits"),
     [
-        pytest.param("neurora", 335, marks=pytest.mark.large),
+        pytest.param("neurora", 343, marks=pytest.mark.large),
         ("neurora-v2", 73),
-        pytest.param("neurora-round", 336, marks=pytest.mark.large),
+        pytest.param("neurora-round", 344, marks=pytest.mark.large),
     ],
 )
 def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> None:

@@ -30,6 +30,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -104,34 +105,35 @@ def settle(
     weights: EdgeWeights,
     structure: Structure,
     priors: RefinementPriors = PRIORS,
-    steps: int = 0,
+    steps: Tensor | int = 0,
 ) -> Refined:
     """Shaped steps until convergence, then steps with the noise's density.
 
     Args:
         orientations: ``(N, 4)``, where coarse steps have led.
-        steps: number of these, which count among ``max_steps``.
+        steps: ``(C,)`` number of these, which count among ``max_steps``.
     """
     problem = Problem(graph, structure, priors)
     weights = weights._replace(shaped=weights.shaped.float().clamp(min=priors.least_prior))
-    settled = shaped_steps(problem, orientations, weights, priors.max_steps - steps)
-    further = min(priors.density.max_steps, priors.max_steps - steps - settled.steps)
+    most = priors.max_steps - torch.as_tensor(steps, device=graph.device)
+    settled = shaped_steps(problem, orientations, weights, most)
+    further = (most - settled.steps).clamp(max=priors.density.max_steps)
     cost = problem.cost(settled.orientations, weights.shaped)
-    return Refined(_by_density(problem, settled, weights, further) if further > 0 else settled.orientations, cost)
+    return Refined(_by_density(problem, settled, weights, further), cost)
 
 
 class Settled(NamedTuple):
-    """Result of ℓ½ steps: orientations ``(N, 4)``, the noise there, variances ``(N,)``, number of steps."""
+    """Result of ℓ½ steps: orientations ``(N, 4)``, the noise there, variances ``(N,)``, number of steps ``(C,)``."""
 
     orientations: Tensor
     noise: NoiseShape
     variance: Tensor
-    steps: int
+    steps: Tensor
 
 
 def coarse_steps(
     problem: Problem, orientations: Tensor, weight: Tensor, is_over: Callable[[Tensor], Tensor] | None = None
-) -> tuple[Tensor, int]:
+) -> tuple[Tensor, Tensor]:
     """ℓ1 steps until they have settled.
 
     Args:
@@ -140,79 +142,88 @@ def coarse_steps(
         is_over: components ``(C,)`` bool that orientations ``(N, 4)`` need no further steps in; default: none.
 
     Returns:
-        ``(N, 4)`` float64 orientations; the number of steps.
+        ``(N, 4)`` float64 orientations; the number of steps of each component ``(C,)``.
     """
     priors = problem.priors
     max_steps = min(priors.max_coarse_steps, priors.max_steps - priors.least_shaped_steps)
     orientations = orientations.double()
     prior = weight.float().clamp(min=priors.least_prior)
-    measure = Measure(problem.round, problem.evenly(priors.coarse_smoothing**2 / 2), l1_weight, torch.float32)
     is_open = torch.ones_like(problem.roots, dtype=torch.bool)
-    for number in range(max_steps):
+    measure = Measure(
+        problem.round, problem.evenly(priors.coarse_smoothing**2 / 2), l1_weight, problem.everywhere(True)
+    )
+    steps = torch.zeros_like(problem.roots)
+    for _ in range(max_steps):
         typical = problem.typical(problem.sample(orientations))
         step = problem.step(orientations, measure, problem.pooled(orientations, measure, prior), is_open)
-        orientations = _turned(orientations, step.turn)
+        orientations, steps = _turned(orientations, step.turn), steps + is_open
         is_open = is_open & (problem.mean(step.turn.norm(dim=0)) >= priors.coarse_settled * typical)
         if is_over is not None:
             is_open = is_open & ~is_over(orientations)
         if not bool(is_open.any()):
-            return orientations, number + 1
-    return orientations, max(max_steps, 0)
+            break
+    return orientations, steps
 
 
-def shaped_steps(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_steps: int) -> Settled:
-    """ℓ½ steps with the noise's estimated shape and size, until convergence."""
+def shaped_steps(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_steps: Tensor | int) -> Settled:
+    """ℓ½ steps with the noise's estimated shape and size, until convergence.
+
+    Args:
+        max_steps: ``(C,)`` maximum number in each component. What is estimated there is no longer changed after the
+            last, so that other components' steps do not matter.
+    """
     priors, prior = problem.priors, weights.shaped
     noise = problem.round
     variance = problem.variance_of_means()
     dispersion = torch.ones_like(problem.roots, dtype=orientations.dtype)
-    dtype, step = torch.float32, None
-    is_open = torch.ones_like(problem.roots, dtype=torch.bool)
-    is_held = torch.zeros_like(is_open)
-    for number in range(max_steps):
+    step, steps = None, torch.zeros_like(problem.roots)
+    max_steps = steps + max_steps
+    is_open = max_steps > 0
+    is_held, is_single = ~is_open, problem.everywhere(False)
+    is_noisy = torch.zeros_like(is_open)
+    while bool(is_open.any()):
         unit = None if weights.unit is None else _in_world(weights.unit, orientations, problem.graph.target)
         if step is not None and bool(is_held.all()):
             carried = problem.shapes.carried(noise, orientations)
-            measure = Measure(carried, variance, l_half_weight, dtype, step.source_share, unit)
+            measure = Measure(carried, variance, l_half_weight, is_single, step.source_share, unit)
         else:
             sample = problem.sample(orientations, unit)
-            is_noisy = problem.is_well_knit and bool((problem.typical(sample) > priors.coarse_noise).all())
-            dtype = torch.float32 if is_noisy else torch.float64
+            is_noisy = torch.where(is_held, is_noisy, problem.typical(sample) > priors.coarse_noise)
+            is_single = np.array(is_noisy.tolist())
             noise = problem.shapes.estimate(sample, orientations, noise, is_held)
-            measure = Measure(noise, variance, l_half_weight, dtype, unit=unit)
+            measure = Measure(noise, variance, l_half_weight, is_single, unit=unit)
             pooled = problem.pooled(orientations, measure, prior)
             dispersion = torch.where(is_held, dispersion, problem.dispersion(sample, measure, pooled))
             if step is not None and len(is_held) > 1 and bool(is_held.any()):
                 of_edge = is_held[problem.component].index_select(0, problem.graph.source)
                 measure = measure._replace(source_share=step.source_share, is_held=of_edge)
         step = problem.step(orientations, measure, problem.pooled(orientations, measure, prior), is_open)
-        variance = (dispersion[problem.component] / step.weight).clamp(min=priors.least_square / 2)
+        found = (dispersion[problem.component] / step.weight).clamp(min=priors.least_square / 2)
+        variance = torch.where(is_open[problem.component], found, variance)
         length = (step.decrement / (dispersion * problem.num_nodes)).sqrt()
         stretch = torch.where(length < priors.stretched, priors.relaxation, 1.0)
-        orientations = _turned(orientations, stretch[problem.component] * step.turn)
-        is_held = is_held | ~(length >= priors.held)  # also where there is no noise and the length is NaN
-        is_open = is_open & (length >= priors.converged)
+        orientations, steps = _turned(orientations, stretch[problem.component] * step.turn), steps + is_open
+        is_open = is_open & (length >= priors.converged) & (steps < max_steps)
         is_open = is_open & (problem.largest(step.turn.norm(dim=0)) >= priors.converged_angle)
-        if not bool(is_open.any()):
-            max_steps = number + 1
-            break
-    return Settled(orientations, problem.shapes.carried(noise, orientations), variance, max_steps)
+        # Held, too, where there is no noise and the length is NaN.
+        is_held = is_held | ~(length >= priors.held) | ~is_open
+    return Settled(orientations, problem.shapes.carried(noise, orientations), variance, steps)
 
 
-def _by_density(problem: Problem, settled: Settled, weights: EdgeWeights, max_steps: int) -> Tensor:
-    """Steps with the density of highest likelihood, in components where that is not the density of ℓ½."""
+def _by_density(problem: Problem, settled: Settled, weights: EdgeWeights, max_steps: Tensor) -> Tensor:
+    """At most ``max_steps`` ``(C,)`` with the density of highest likelihood, where that is not the density of ℓ½."""
     priors, prior = problem.priors, weights.shaped
     orientations, noise, variance, _ = settled
     density: NoiseDensity | None = None
-    is_open = torch.ones_like(problem.roots, dtype=torch.bool)
-    for _ in range(max_steps):
+    is_open, number = max_steps > 0, 0
+    while bool(is_open.any()):
         unit = None if weights.unit is None else _in_world(weights.unit, orientations, problem.graph.target)
         sample = problem.sample(orientations, unit)
         noise = problem.shapes.carried(noise, orientations)
-        measure = Measure(noise, variance, l_half_weight, torch.float64, unit=unit)
+        measure = Measure(noise, variance, l_half_weight, problem.everywhere(False), unit=unit)
         if density is None:
             density = problem.density(sample, measure, prior)
-            is_open = density.is_other
+            is_open = is_open & density.is_other
             if not bool(is_open.any()):
                 break
         measure = measure._replace(weigh=density.weigh)
@@ -223,9 +234,8 @@ def _by_density(problem: Problem, settled: Settled, weights: EdgeWeights, max_st
         variance = torch.where(density.is_other[problem.component], of_other, variance)
         orientations = _turned(orientations, step.turn)
         length = (step.decrement / (dispersion * problem.num_nodes)).sqrt()
-        is_open = is_open & (length >= priors.converged)
-        if not bool(is_open.any()):
-            break
+        number += 1
+        is_open = is_open & (length >= priors.converged) & (max_steps > number)
     return orientations
 
 

@@ -95,7 +95,7 @@ def _solved(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) ->
         kind = PaperCleanNet if "cleannet" in stages.as_written else CleanNet
         cleaned = clean(networks.load(kind), graph) if stages.clean else trust_all(graph)
         judged = cleaned = apply_labels(cleaned, graph.label)
-    is_believed = False
+    is_believed = torch.zeros(int(component.max()) + 1, dtype=torch.bool, device=graph.device)
     if stages.cycles and "cycles" not in stages.as_written:
         with watch.stage("cycles"):
             cleaned, is_believed = with_triangles(judged, component, stages.clean)
@@ -145,14 +145,14 @@ class _Cleared(NamedTuple):
 
     Attributes:
         judged: edges with CleanNet's scores and the labels.
-        is_believed: whether triangles confirm these scores.
+        is_believed: ``(C,)`` bool, components in which triangles confirm these scores.
         cleaned: edges with the triangles' evidence included, as used by the tree.
         parent_edge: ``(N,)`` the tree.
         structure: the graph's connections.
     """
 
     judged: Cleaned
-    is_believed: bool
+    is_believed: Tensor
     cleaned: Cleaned
     parent_edge: Tensor
     structure: Structure

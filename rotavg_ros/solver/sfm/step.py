@@ -7,15 +7,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from rotavg_ros.solver.algebra.canonical_form import evenly_spread
 from rotavg_ros.solver.algebra.relaxed_forest import cheapest_forest
-from rotavg_ros.solver.algebra.residuals import SLICE_EDGES, EdgeResiduals, measured_rows
+from rotavg_ros.solver.algebra.residuals import SLICE_EDGES, EdgeResiduals
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.running.threads import for_each, slices, stretches
+from rotavg_ros.solver.sfm.groups import WAYS, Group, Way
 from rotavg_ros.solver.sfm.laplacians.block import Arrivals, BlockLaplacian, Laplacian, SplitWeights, factorised
 from rotavg_ros.solver.sfm.laplacians.edge import EdgeLaplacian, MatrixWeights
 from rotavg_ros.solver.sfm.noise_density import NoiseDensity
@@ -72,7 +74,8 @@ class Measure(NamedTuple):
         shape: shape of the noise.
         variance: ``(N,)`` variances of the nodes, in units of the shape; without numerical floors.
         weigh: function (expected squared residuals of edges, which edges these are) → robust weights.
-        dtype: precision in which residuals and systems are computed where graphs are well knit; elsewhere it is double.
+        is_single: ``(C,)`` bool, components whose residuals and systems are in single precision if they are well knit;
+            elsewhere precision is double. In NumPy, so that a step does not wait for an accelerator.
         source_share: ``(M,)`` probability that each edge's noise is in its source's frame; None: from residuals.
         unit: ``(6, M)`` entries of T in the world's frame: residuals r count as T r (``stated/shape.py``), and the
             noise's shape is that of T r; None: T = 1.
@@ -83,7 +86,7 @@ class Measure(NamedTuple):
     shape: NoiseShape
     variance: Tensor
     weigh: Callable[[Tensor, slice | Tensor], Tensor]
-    dtype: torch.dtype
+    is_single: np.ndarray
     source_share: Tensor | None = None
     unit: Tensor | None = None
     is_held: Tensor | None = None
@@ -91,6 +94,18 @@ class Measure(NamedTuple):
     def in_units(self, vector: Tensor, edges: slice | Tensor) -> Tensor:
         """``T r`` of some edges with residuals ``(3, k)``; or ``T`` times their pulls."""
         return vector if self.unit is None else times(self.unit[:, edges].to(vector), vector)
+
+    def of(self, group: Group) -> Measure:
+        """The same for the edges of a group alone."""
+        edge = group.edge
+        if edge is None:
+            return self
+        share, unit, is_held = (
+            None if value is None else group.of(value) for value in (self.source_share, self.unit, self.is_held)
+        )
+        return self._replace(
+            weigh=lambda square, edges: self.weigh(square, edge[edges]), source_share=share, unit=unit, is_held=is_held
+        )
 
     def rows(self, dtype: torch.dtype) -> Tensor:
         """The nodes' values used by their edges, ``(k, N)``: variance and, unless noise is round, six shape entries."""
@@ -173,6 +188,21 @@ class Step(NamedTuple):
         turn = torch.where(chosen[component], self.turn, 0.0)
         return self._replace(turn=turn, decrement=torch.where(chosen, self.decrement, 0.0))
 
+    def but(self, chosen: Tensor, other: Step, component: Tensor, source: Tensor) -> Step:
+        """The same but for the chosen components ``(C,)``, which are ``other``'s.
+
+        Args:
+            component: ``(N,)`` of every node.
+            source: ``(M,)`` of the edges.
+        """
+        of_node = chosen[component]
+        return Step(
+            torch.where(of_node, other.turn, self.turn),
+            torch.where(of_node, other.weight, self.weight),
+            torch.where(chosen, other.decrement, self.decrement),
+            torch.where(of_node[source], other.source_share, self.source_share),
+        )
+
 
 class Pull(NamedTuple):
     """Weights and forces of the edges at given orientations.
@@ -188,6 +218,10 @@ class Pull(NamedTuple):
     force: Tensor
 
 
+# Groups of components change while components converge, one after the other.
+_KEPT_GROUPS = 4
+
+
 class Problem:
     """What stays the same from step to step, for a graph of C components."""
 
@@ -199,16 +233,21 @@ class Problem:
         self._accepted, self._believed = structure.accepted, structure.accepted
         if len(self._accepted):  # the weights of those in series are by their blame
             self._believed = self._accepted[~torch.isin(self._accepted, self.series.edge)]
-        self.arrivals = Arrivals(structure.edges)
+        self._whole = Group(graph, None, Arrivals(structure.edges), self.roots)
+        self._groups: dict[bytes, Group] = {}
         self.round = NoiseShape.round(graph.num_nodes, graph.device)
-        self.is_well_knit = 2 * graph.num_edges >= priors.well_knit_degree * graph.num_nodes
         self.num_nodes = torch.bincount(self.component, minlength=len(self.roots))
-        self.shapes = ShapeEstimator(self.component, structure.redundancy(graph), priors.shape)
+        redundancy = structure.redundancy(graph)
+        num_edges = redundancy + self.num_nodes - 1
+        is_well_knit = 2 * num_edges >= priors.well_knit_degree * self.num_nodes
+        self.is_well_knit, has_edges = np.array(torch.stack((is_well_knit, num_edges > 0)).tolist())
+        # Nodes without edges need no solving; where there is nothing else, they are solved like all others.
+        self._is_bare = ~has_edges & has_edges.any()
+        self.shapes = ShapeEstimator(self.component, redundancy, priors.shape)
         self._chosen = evenly_spread(self.component.index_select(0, graph.source), len(self.roots), priors.max_sample)
         self._some = graph.select_edges(self._chosen)
         self._component_of_some = self.component[self._some.source]
         self._count_of_some = torch.bincount(self._component_of_some, minlength=len(self.roots)).clamp(min=1)
-        self._measured = measured_rows(graph.target_from_source, torch.float32)
 
     def mean(self, value: Tensor) -> Tensor:
         """Means ``(C,)`` over each component of the nodes' values ``(N,)``."""
@@ -225,6 +264,10 @@ class Problem:
     def evenly(self, value: float) -> Tensor:
         """The value for every node, ``(N,)``."""
         return torch.full((self.graph.num_nodes,), value, dtype=torch.float64, device=self.graph.device)
+
+    def everywhere(self, value: bool) -> np.ndarray:
+        """The value for every component, ``(C,)``."""
+        return np.full(len(self.roots), value)
 
     def variance_of_means(self) -> Tensor:
         """Variances ``(N,)`` of nodes whose edges all have weight 1: three axes of unit variance, over the degree."""
@@ -331,75 +374,107 @@ class Problem:
         return value.new_zeros(len(self.roots)).index_add_(0, self._component_of_some, value)
 
     def step(self, orientations: Tensor, measure: Measure, prior: Tensor, is_open: Tensor) -> Step:
-        """The least-squares step of the open components ``(C,)``; it is zero in the others."""
-        prior = self._believing(orientations, measure, prior)
-        if self.is_well_knit:
-            step, is_solved = self._solved(orientations, measure, prior, is_open)
-            self.is_well_knit = bool(is_solved.all())
-        if not self.is_well_knit:
-            # Along a ring of thousands of cameras rounding to single precision exceeds what is to be solved for.
-            exact = measure._replace(dtype=torch.float64)
-            step, is_solved = self._solved(orientations, exact, prior, is_open)
-            step = step.only(is_solved, self.component)
-        return step
+        """The least-squares step of the open components ``(C,)``; it is zero in the others.
 
-    def _solved(self, orientations: Tensor, measure: Measure, prior: Tensor, is_open: Tensor) -> tuple[Step, Tensor]:
-        """The step as it is found, and the components ``(C,)`` in which it is as good as asked for."""
-        weights, matrix, force = self._pull(orientations, measure, prior)
+        Each component is solved as if it were alone, so that its answer does not depend on the others.
+        """
+        found: Step | None = None
+        prior = self._believing(orientations, measure, prior)
+        for way in WAYS:
+            chosen = way.chosen(self.is_well_knit, measure.is_single)
+            if not (chosen & ~self._is_bare).any():
+                continue
+            chosen = chosen | self._is_bare
+            step, is_solved = self._solved(way, self._group(chosen), orientations, measure, prior, is_open)
+            if is_solved is not None and way.is_factorised:
+                step = step.only(is_solved, self.component)
+            elif is_solved is not None:  # the others are factorised
+                self.is_well_knit = self.is_well_knit & (np.array(is_solved.tolist()) | ~chosen)
+            if found is not None:
+                of_group = torch.from_numpy(chosen).to(self.component.device)
+                step = found.but(of_group, step, self.component, self.graph.source)
+            found = step
+        assert found is not None
+        return found
+
+    def _group(self, chosen: np.ndarray) -> Group:
+        """The chosen components ``(C,)``; the last few groups are kept."""
+        if chosen.all():
+            return self._whole
+        key = chosen.tobytes()
+        if key not in self._groups:
+            is_node = torch.from_numpy(chosen).to(self.component.device)[self.component]
+            if len(self._groups) == _KEPT_GROUPS:
+                self._groups.clear()
+            self._groups[key] = Group.some(self.graph, self.roots, is_node)
+        return self._groups[key]
+
+    def _solved(
+        self, way: Way, group: Group, orientations: Tensor, measure: Measure, prior: Tensor, is_open: Tensor
+    ) -> tuple[Step, Tensor | None]:
+        """The step of a group's components, zero in the others, and where it is as good as asked for.
+
+        That is ``(C,)`` bool; None: everywhere.
+        """
+        graph, measure = group.graph, measure.of(group)
+        weights, matrix, force = _pull(group, orientations, measure, group.of(prior), way.dtype)
         force *= is_open[self.component]
         system: Laplacian
         if matrix is None:
-            system = BlockLaplacian(self.arrivals, weights, measure.shape, self.component)
+            system = BlockLaplacian(group.arrivals, weights, measure.shape, self.component)
         else:
-            system = EdgeLaplacian(self.arrivals, MatrixWeights(matrix, weights.total), self.component)
-        if self.is_well_knit:
+            system = EdgeLaplacian(group.arrivals, MatrixWeights(matrix, weights.total), self.component)
+        if not way.is_factorised:
             approximate = system.diagonal_solve()
         elif matrix is None:
             # Cameras of a component share their noise's shape, and rotating it leaves its trace unchanged.
-            trace = measure.shape.information.diagonal().sum(dim=1)[self.graph.source]
-            approximate = factorised(self.graph, weights.total * trace / 3, self.roots)
+            trace = measure.shape.information.diagonal().sum(dim=1)[graph.source]
+            approximate = factorised(graph, weights.total * trace / 3, group.fixed)
         else:
-            approximate = factorised(self.graph, matrix[[0, 3, 5]].mean(dim=0), self.roots)
+            approximate = factorised(graph, matrix[[0, 3, 5]].mean(dim=0), group.fixed)
         turn, is_solved = system.solve(force, approximate, self.priors.least_angle, self.priors.step_tolerance)
         decrement = (force * turn).sum(dim=0).double()
         turn = (turn - turn[:, self.roots[self.component]]).double()
-        return Step(turn, system.weight_sum.double(), self.sum(decrement), weights.source_share), is_solved
+        share = group.among_all(weights.source_share, self.graph.num_edges)
+        return Step(turn, system.weight_sum.double(), self.sum(decrement), share), is_solved
 
-    def _pull(self, orientations: Tensor, measure: Measure, prior: Tensor) -> Pull:
-        graph, dtype = self.graph, measure.dtype
-        measured = self._measured if dtype == self._measured.dtype else None
-        residuals = EdgeResiduals(graph, orientations.to(dtype), measured)
-        rows, prior = measure.rows(dtype), prior.to(dtype)
-        held = None if measure.source_share is None else measure.source_share.to(dtype)
-        is_held = measure.is_held
-        share = torch.empty_like(prior) if held is None or is_held is not None else held
-        weights = SplitWeights(torch.empty_like(prior), share)
-        matrix = None if measure.unit is None else prior.new_empty(6, graph.num_edges)
-        parts = stretches(slices(graph.num_edges, SLICE_EDGES, graph.device))
-        # Components in rows: adding columns up by node is a dozen times as fast as adding up rows.
-        forces = [rows.new_zeros(3, graph.num_nodes) for _ in parts]
 
-        def walk(part: int) -> None:
-            for edges in parts[part]:
-                source, target = graph.source[edges], graph.target[edges]
-                at_source, at_target = rows.index_select(1, source), rows.index_select(1, target)
-                vector = measure.in_units(residuals.vectors(edges), edges)
-                shares = (None if value is None else value[edges] for value in (held, is_held))
-                expected = Expected.of(vector, at_source, at_target, *shares)
-                robust = measure.weigh(expected.square + expected.variance, edges).mul_(prior[edges])
-                weights.total[edges] = robust
-                if share is not held:
-                    weights.source_share[edges] = expected.source_share
-                pull = measure.in_units(expected.pull.mul_(robust), edges)
-                if matrix is not None and measure.unit is not None:
-                    information = Expected.information(at_source, at_target, expected.source_share)
-                    in_world = turned(information, full(measure.unit[:, edges].to(dtype)))
-                    matrix[:, edges] = robust * distinct_entries(in_world)
-                forces[part].index_add_(1, target, pull)
-                forces[part].index_add_(1, source, pull.neg_())  # with alpha = -1 it takes six times as long
+def _pull(group: Group, orientations: Tensor, measure: Measure, prior: Tensor, dtype: torch.dtype) -> Pull:
+    """At orientations ``(N, 4)``, given the group's own measure and prior weights ``(K,)``."""
+    graph = group.graph
+    measured = group.measured if dtype == torch.float32 else None
+    residuals = EdgeResiduals(graph, orientations.to(dtype), measured)
+    rows, prior = measure.rows(dtype), prior.to(dtype)
+    held = None if measure.source_share is None else measure.source_share.to(dtype)
+    is_held = measure.is_held
+    share = torch.empty_like(prior) if held is None or is_held is not None else held
+    weights = SplitWeights(torch.empty_like(prior), share)
+    matrix = None if measure.unit is None else prior.new_empty(6, graph.num_edges)
+    parts = stretches(slices(graph.num_edges, SLICE_EDGES, graph.device))
+    # Components in rows: adding columns up by node is a dozen times as fast as adding up rows.
+    forces = [rows.new_zeros(3, graph.num_nodes) for _ in parts]
 
-        for_each(walk, range(len(parts)))
-        return Pull(weights, matrix, torch.stack(forces).sum(dim=0))
+    def walk(part: int) -> None:
+        for edges in parts[part]:
+            source, target = graph.source[edges], graph.target[edges]
+            at_source, at_target = rows.index_select(1, source), rows.index_select(1, target)
+            vector = measure.in_units(residuals.vectors(edges), edges)
+            shares = (None if value is None else value[edges] for value in (held, is_held))
+            expected = Expected.of(vector, at_source, at_target, *shares)
+            robust = measure.weigh(expected.square + expected.variance, edges).mul_(prior[edges])
+            weights.total[edges] = robust
+            if share is not held:
+                weights.source_share[edges] = expected.source_share
+            pull = measure.in_units(expected.pull.mul_(robust), edges)
+            if matrix is not None and measure.unit is not None:
+                information = Expected.information(at_source, at_target, expected.source_share)
+                in_world = turned(information, full(measure.unit[:, edges].to(dtype)))
+                matrix[:, edges] = robust * distinct_entries(in_world)
+            forces[part].index_add_(1, target, pull)
+            forces[part].index_add_(1, source, pull.neg_())  # with alpha = -1 it takes six times as long
+
+    for_each(walk, range(len(parts)))
+    return Pull(weights, matrix, torch.stack(forces).sum(dim=0))
 
 
 def accepted_edges(graph: ViewGraph) -> Tensor:

@@ -79,7 +79,7 @@ def test_block_systems_are_numpys_least_squares(is_factorised: bool) -> None:
     mean_weight = weight * shape.information.diagonal().sum(dim=1)[graph.source] / 3
     precondition = factorised(graph, mean_weight, roots) if is_factorised else system.diagonal_solve()
     found, is_solved = system.solve(torch.from_numpy(force), precondition, 1e-12, 0.0)
-    assert bool(is_solved.all())
+    assert is_solved is None
     root = roots[graph.components()]
     np.testing.assert_allclose(found - found[:, root], x - x[:, root], atol=1e-8)
 
@@ -174,7 +174,7 @@ def test_a_coarse_step_along_a_long_ring_is_scipys_least_squares() -> None:
     noise = Rotation.from_rotvec(0.01 * rng.standard_normal((len(source), 3)))
     graph, prior = measured(truth, source, target, noise), 10 ** rng.uniform(-6, 0, len(source))
     problem = Problem(graph, Structure.of(graph), refinement.PRIORS)
-    measure = Measure(problem.round, problem.evenly(5e-5), l1_weight, torch.float32)
+    measure = Measure(problem.round, problem.evenly(5e-5), l1_weight, np.array([True]))
     step = problem.step(as_quaternions(truth), measure, torch.from_numpy(prior), torch.tensor([True]))
 
     residual = (truth[target].inv() * Rotation.from_quat(graph.target_from_source.numpy()) * truth[source]).as_rotvec()

@@ -313,7 +313,7 @@ def test_systems_are_numpys_least_squares(is_factorised: bool) -> None:
     mean_weight = torch.from_numpy(np.trace(weight, axis1=1, axis2=2) / 3)
     precondition = factorised(graph, mean_weight, roots) if is_factorised else system.diagonal_solve()
     found, is_solved = system.solve(torch.from_numpy(force), precondition, 1e-12, 0.0)
-    assert bool(is_solved.all())
+    assert is_solved is None
     torch.testing.assert_close((found - found[:, :1])[:, :20], (x - x[:, :1])[:, :20], atol=1e-8, rtol=0)
 
 

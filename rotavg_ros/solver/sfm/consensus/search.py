@@ -66,7 +66,8 @@ def consensus(
     """
     angle = EdgeResiduals(graph, body_from_world.float()).angles() if angle is None else angle
     is_off, count = angle > NUMBERS.outlier_angle, int(component.max()) + 1
-    contradicting = Triangles.of(graph, count * priors.glance, is_off).contradicting(
+    most = torch.full((count,), priors.glance, device=component.device)
+    contradicting = Triangles.of(graph, most, is_off, component).contradicting(
         is_off, component.index_select(0, graph.source), count, priors.closing[0]
     )
     numbers = (contradicting > priors.contradicting).nonzero()[:, 0].tolist()

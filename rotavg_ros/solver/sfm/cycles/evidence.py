@@ -58,11 +58,11 @@ class Checked(NamedTuple):
 
     Attributes:
         cleaned: edges with the combined probabilities.
-        is_believed: whether CleanNet counts for more than triangles in any component.
+        is_believed: ``(C,)`` bool, components in which CleanNet counts for more than triangles.
     """
 
     cleaned: Cleaned
-    is_believed: bool
+    is_believed: Tensor
 
 
 def with_triangles(
@@ -81,15 +81,15 @@ def with_triangles(
     few = torch.full((edges.count,), priors.few_paths, device=component.device)
     triangles = Triangles.of(cleaned.measured, few, component=component, run=priors.run)
     if len(triangles.angle) == 0:
-        return Checked(cleaned, is_judged)
+        return Checked(cleaned, torch.full_like(few, is_judged, dtype=torch.bool))
     trust = _trust(said, triangles, edges, priors) if is_judged else said.new_zeros(edges.count)
     if bool((trust == 1).all()):
-        return Checked(cleaned, True)
+        return Checked(cleaned, trust > 0.5)
     logit = _logit_by_triangles(cleaned, component, edges, said, priors)
-    trust = _of_each(trust, edges.component).expand_as(said)
-    blended = _with_logit(cleaned, trust * said + (1 - trust) * logit)
-    probability = torch.where(trust == 1, cleaned.outlier_probability, blended.outlier_probability)
-    return Checked(replace(cleaned, outlier_probability=probability), bool((trust > 0.5).any()))
+    of_edge = _of_each(trust, edges.component).expand_as(said)
+    blended = _with_logit(cleaned, of_edge * said + (1 - of_edge) * logit)
+    probability = torch.where(of_edge == 1, cleaned.outlier_probability, blended.outlier_probability)
+    return Checked(replace(cleaned, outlier_probability=probability), trust > 0.5)
 
 
 def by_triangles(cleaned: Cleaned, component: Tensor, priors: CyclePriors = CYCLES) -> Cleaned:
@@ -249,13 +249,25 @@ class _Closing:
 
 def _trust(said: Tensor, triangles: Triangles, edges: _Edges, priors: CyclePriors) -> Tensor:
     """``(C,)`` a: the weight of ``said`` ``(M,)``, CleanNet's log-odds, relative to triangles."""
-    saying, held_back = (Triangles(triangles.edge[:, k::2], triangles.angle[k::2].contiguous()) for k in (0, 1))
+    saying, held_back = _halves(triangles, edges)
     if len(held_back.angle) == 0:
         return said.new_ones(edges.count)
     by_triangles = _by_triangles(saying, _Beforehand(edges, torch.zeros_like(said), priors))
     gained, possible = (_gain(logit, held_back, edges, priors) for logit in (said, by_triangles))
     # A gain that a few triangles may reach by chance is no evidence about CleanNet.
     return ((gained + priors.by_chance) / (priors.full_trust * possible + priors.by_chance)).clamp(max=1)
+
+
+def _halves(triangles: Triangles, edges: _Edges) -> tuple[Triangles, Triangles]:
+    """Every other triangle of each component, which stand together, and the rest."""
+    if edges.count == 1:
+        first, second = (Triangles(triangles.edge[:, k::2], triangles.angle[k::2].contiguous()) for k in (0, 1))
+        return first, second
+    component = edges.component[triangles.edge[0]]
+    count = torch.bincount(component, minlength=edges.count)
+    rank = torch.arange(len(component), device=component.device) - (count.cumsum(0) - count)[component]
+    first, second = (Triangles(triangles.edge[:, rank % 2 == k], triangles.angle[rank % 2 == k]) for k in (0, 1))
+    return first, second
 
 
 def _gain(logit: Tensor, triangles: Triangles, edges: _Edges, priors: CyclePriors) -> Tensor:

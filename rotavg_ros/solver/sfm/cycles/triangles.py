@@ -50,8 +50,10 @@ class Triangles:
                 triangles of a few edges rather than a few of many edges.
         """
         key, source, target, order = graph.source * graph.num_nodes + graph.target, graph.source, graph.target, None
-        if not bool((key[1:] >= key[:-1]).all()):  # a canonical form is already sorted; copying it would cost memory
+        is_sorted, has_parallels = _looked_at(key)
+        if not is_sorted:  # a canonical form is; copying it would cost memory
             key, order = key.sort(stable=True)
+            _, has_parallels = _looked_at(key)
             source, target = source[order], target[order]
         first = torch.searchsorted(source, torch.arange(graph.num_nodes + 1, device=graph.device))
         # Each edge u→v is followed by every edge v→w.
@@ -74,7 +76,7 @@ class Triangles:
             along = path[parts[number]]
             one = torch.searchsorted(up_to, along, right=True)
             two = first[target[one]] + along - (up_to[one] - count[one])
-            edge = torch.stack(_closed(one, two, key, source[one] * graph.num_nodes + target[two]))
+            edge = torch.stack(_closed(one, two, key, source[one] * graph.num_nodes + target[two], has_parallels))
             edge = edge if order is None else order[edge]
             edge = edge if among is None else edge[:, among[edge].any(dim=0)]
             measured = [graph.target_from_source[each].double() for each in edge]
@@ -114,20 +116,30 @@ class Triangles:
         return (nearest - by_chance) / (by_chance + 1).sqrt()
 
 
-def _closed(one: Tensor, two: Tensor, key: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _looked_at(key: Tensor) -> tuple[bool, bool]:
+    """Whether numbers are sorted, and whether neighbours are the same."""
+    is_sorted, has_same = torch.stack(((key[1:] >= key[:-1]).all(), (key[1:] == key[:-1]).any())).tolist()
+    return is_sorted, has_same
+
+
+def _closed(
+    one: Tensor, two: Tensor, key: Tensor, wanted: Tensor, has_parallels: bool
+) -> tuple[Tensor, Tensor, Tensor]:
     """Paths of edges ``one`` and ``two`` ``(P,)``, each with every edge that closes it, ``(T,)``.
 
     Args:
         key: ``(M,)`` sorted, one number for both ends of each edge.
         wanted: ``(P,)`` that of the edges that close each path.
+        has_parallels: whether any number is there twice.
     """
     begin = torch.searchsorted(key, wanted)
     is_closed = key[begin.clamp(max=len(key) - 1)] == wanted
-    one, two, begin, wanted = (value[is_closed] for value in (one, two, begin, wanted))
+    closed = is_closed.nonzero().squeeze(1)
+    one, two, begin, wanted = (value[closed] for value in (one, two, begin, wanted))
+    if not has_parallels:
+        return one, two, begin
     parallel = torch.searchsorted(key, wanted, right=True) - begin
     taken = parallel.clamp(max=_MOST_CLOSING)
-    if bool((taken == 1).all()):
-        return one, two, begin
     path = torch.arange(len(one), device=one.device).repeat_interleave(taken)
     rank = torch.arange(len(path), device=one.device) - (taken.cumsum(0) - taken)[path]
     return one[path], two[path], begin[path] + rank * parallel[path] // taken[path]

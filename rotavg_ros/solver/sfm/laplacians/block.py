@@ -120,8 +120,10 @@ class Laplacian(ABC):
 
     def solve(
         self, force: Tensor, precondition: Preconditioner, tolerance: float, relative_tolerance: float
-    ) -> tuple[Tensor, Tensor]:
-        """``L⁻¹ force`` ``(3, N)``, up to a constant in every component, and where it is as good as asked for ``(C,)``.
+    ) -> tuple[Tensor, Tensor | None]:
+        """``L⁻¹ force`` ``(3, N)``, up to a constant in every component, and where it is as good as asked for.
+
+        That is ``(C,)`` bool; None: everywhere.
 
         Args:
             force: sums to zero over every component.

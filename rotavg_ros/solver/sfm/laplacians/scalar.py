@@ -38,7 +38,7 @@ class ScalarLaplacian:
         degree = torch.where(self._degree > 0, self._degree, 1.0)
         stop = Stop(0.0, _SOLVED, MAX_ITERATIONS)
         solution, is_solved = conjugate_gradients(self._product, lambda x: x / degree, force, self._components, stop)
-        return solution, bool(is_solved.all())
+        return solution, is_solved is None or bool(is_solved.all())
 
     def _product(self, x: Tensor) -> Tensor:
         return self._degree * x - arriving(self._adjacency, x)

@@ -47,14 +47,14 @@ class Begun(NamedTuple):
     Attributes:
         body_from_world: ``(N, 4)``.
         coarse: ``(M,)`` the weights that these steps used.
-        steps: number of steps.
+        steps: ``(C,)`` number of steps.
         rival: another solution in some components, whose cost is too close to decide by; None: nowhere.
         parts: parts of the graph that few edges join; None: it was not searched for any.
     """
 
     body_from_world: Tensor
     coarse: Tensor
-    steps: int
+    steps: Tensor
     rival: Begun | None = None
     parts: Parts | None = None
 
@@ -168,7 +168,7 @@ class _Found(NamedTuple):
         if not bool(chosen.any()):
             return self
         priors, begun = problem.priors, self.begun
-        few = min(priors.telling_steps, priors.max_steps - begun.steps)
+        few = (priors.max_steps - begun.steps).clamp(max=priors.telling_steps)
         further = shaped_steps(problem, begun.body_from_world, EdgeWeights(shaped, shaped), few).orientations
         return self.but(problem, chosen, _Found.at(problem, begun, further, shaped))
 
@@ -198,7 +198,7 @@ def _where(problem: Problem, chosen: Tensor, one: Begun, other: Begun) -> Begun:
     of_node = chosen[problem.component]
     orientations = torch.where(of_node[:, None], one.body_from_world, other.body_from_world)
     coarse = torch.where(of_node[problem.graph.source], one.coarse, other.coarse)
-    return Begun(orientations, coarse, max(one.steps, other.steps))
+    return Begun(orientations, coarse, torch.where(chosen, one.steps, other.steps))
 
 
 def _share_apart(problem: Problem, one: Tensor, other: Tensor) -> Tensor:

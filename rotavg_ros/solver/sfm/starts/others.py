@@ -28,12 +28,12 @@ def is_sparse(graph: ViewGraph, component: Tensor) -> Tensor:
     return 2 * edges < PRIORS.starts.sparse_degree * nodes
 
 
-def other_starts(judged: Cleaned, is_believed: bool, parent_edge: Tensor, component: Tensor) -> list[Start]:
+def other_starts(judged: Cleaned, is_believed: Tensor, parent_edge: Tensor, component: Tensor) -> list[Start]:
     """A start by eigenvectors, begun at a tree that trusts all edges alike, and more starts for sparse components.
 
     Args:
         judged: N nodes, M edges with CleanNet's scores and labels, in canonical form.
-        is_believed: whether triangles confirm these scores.
+        is_believed: ``(C,)`` bool, components in which triangles confirm these scores.
         parent_edge: ``(N,)`` a spanning forest.
         component: ``(N,)`` component of every node.
     """
@@ -42,10 +42,10 @@ def other_starts(judged: Cleaned, is_believed: bool, parent_edge: Tensor, compon
     starts: list[Start] = []
     if bool(sparse.any()):
         starts += [Start(orientations, alike, sparse) for orientations in _by_all_alike(graph, component)]
-        if is_believed:
+        if bool((sparse & is_believed).any()):
             verdict = by_triangles(judged, component)
             by_triangles_too = bootstrap(verdict, component).body_from_world
-            starts.append(Start(by_triangles_too, 1 - verdict.outlier_probability, sparse))
+            starts.append(Start(by_triangles_too, 1 - verdict.outlier_probability, sparse & is_believed))
     if not bool(sparse.all()):
         chosen = _part(graph, parent_edge)
         part, weight = graph.select_edges(chosen), alike[chosen]
