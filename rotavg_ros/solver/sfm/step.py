@@ -17,9 +17,9 @@ from rotavg_ros.solver.algebra.residuals import SLICE_EDGES, EdgeResiduals
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.running.threads import for_each, slices, stretches
-from rotavg_ros.solver.sfm.groups import WAYS, Group, Way
 from rotavg_ros.solver.sfm.laplacians.block import Arrivals, BlockLaplacian, Laplacian, SplitWeights, factorised
 from rotavg_ros.solver.sfm.laplacians.edge import EdgeLaplacian, MatrixWeights
+from rotavg_ros.solver.sfm.laplacians.groups import WAYS, Group, Way
 from rotavg_ros.solver.sfm.noise_density import NoiseDensity
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape, ResidualSample, ShapeEstimator, share_of_first
 from rotavg_ros.solver.sfm.priors import RefinementPriors
