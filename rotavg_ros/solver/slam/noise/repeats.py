@@ -74,32 +74,29 @@ class Repeats(NamedTuple):
         """For n closures that are compared with no others."""
         return cls(np.zeros((_WHOSE, KERNELS, count)), np.zeros((_WHOSE, count), dtype=np.bool_))
 
+    def no_narrower(self, width: float, alone: np.ndarray) -> Repeats:
+        """The same with the density ``(n,)`` of no repeat for kernels narrower than ``width``, rad.
 
-def repeats(closures: Closures, near: Near, gap: float, components: int, narrowest: float) -> Repeats:
+        What is mistaken again is measured again, with the noise of a closure. Narrower kernels make right closures
+        false that all contradict odometry by exactly the same turn. They fade over an octave, so that F is continuous.
+        """
+        octave = np.log2(max(np.degrees(width), REPEAT_DEG[0]) / REPEAT_DEG[0])
+        share = np.clip(1 + np.arange(KERNELS - 1) - octave, 0.0, 1.0)[:, None]
+        density = share * self.density[:, :-1] + (1 - share) * alone
+        return self._replace(density=np.concatenate((density, density.mean(axis=1, keepdims=True)), axis=1))
+
+
+def repeats(closures: Closures, near: Near, gap: float, components: int) -> Repeats:
     """Estimates for some closures.
-
-    What is mistaken again is measured again, with the noise of a closure, so kernels are no narrower than that.
-    Narrower ones make right closures false that all contradict odometry by exactly the same turn.
 
     Args:
         closures: all closures.
         near: n of them, and the false ones that they are compared with.
         gap: steps; ends at most this far apart are near each other.
         components: k.
-        narrowest: rad, least standard deviation of the difference between repeats.
     """
     density, total = _repeats(closures, near, gap, _Kernels.of(components))
-    _widen(density, narrowest)
     return Repeats(density, total > 0)
-
-
-def _widen(density: np.ndarray, narrowest: float) -> None:
-    """Replace kernels narrower than ``narrowest``, in place, by the mixture of both widths next to it."""
-    place = np.clip(np.log2(max(np.degrees(narrowest), REPEAT_DEG[0]) / REPEAT_DEG[0]), 0, len(REPEAT_DEG) - 1)
-    below = min(int(place), len(REPEAT_DEG) - 2)
-    share = place - below
-    density[:, : below + 1] = ((1 - share) * density[:, below] + share * density[:, below + 1])[:, None]
-    density[:, -1] = density[:, :-1].mean(axis=1)
 
 
 class _Kernels(NamedTuple):

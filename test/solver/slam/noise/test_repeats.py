@@ -27,7 +27,7 @@ def test_densities_are_means_over_a_run_those_before_and_all(
     is_told, false = rng.random(count) < 0.9, np.flatnonzero(rng.random(count) < 0.7)
     rows = np.arange(count)
     between = places_near(false, rows, np.isin(rows, false) if both_sides else None, WINDOW)
-    found = repeats(Closures(older, newer, turn.as_quat(), is_told), Near(rows, false, between), GAP, components, 0.0)
+    found = repeats(Closures(older, newer, turn.as_quat(), is_told), Near(rows, false, between), GAP, components)
 
     width = np.radians(REPEAT_DEG)
     for row in rows:
@@ -62,16 +62,21 @@ def test_nobody_is_near_itself() -> None:
 
 @pytest.mark.parametrize("narrowest", [0.0, 0.05, 0.3, 0.4, 20.0])
 def test_no_kernel_is_narrower_than_a_repeat_is_measured(narrowest: float) -> None:
-    """Widths below it are replaced by the mixture of the two next to it, at their distances in octaves."""
-    apart = np.radians([0.0, 0.02, 0.5, 3.0])
-    for angle in apart:
+    """Kernels below it say nothing of repeats; the one next to it does in part, by its distance in octaves."""
+    alone = 0.7
+    for angle in np.radians([0.0, 0.02, 0.5, 3.0]):
         turn = Rotation.from_rotvec([[0, 0, 0.0], [0, 0, angle]]).as_quat()
         closures = Closures(np.array([0.0, 1.0]), np.array([500.0, 501.0]), turn, np.ones(2, dtype=bool))
         near = Near(np.array([1]), np.array([0]), np.array([[0, 1, 1, 1]]))
-        plain = repeats(closures, near, GAP, 1, 0.0).density[:, :, 0]
-        found = repeats(closures, near, GAP, 1, np.radians(narrowest)).density[:, :, 0]
-        octave = np.clip(np.log2(max(narrowest, 1e-9) / REPEAT_DEG[0]), 0, KERNELS - 2)
-        each = np.maximum(np.arange(KERNELS - 1), octave)
-        expected = np.stack([np.interp(each, np.arange(KERNELS - 1), own[:-1]) for own in plain])
-        np.testing.assert_allclose(found[:, :-1], expected, rtol=1e-9)
-        np.testing.assert_allclose(found[:, -1], expected.mean(axis=1), rtol=1e-9)
+        plain = repeats(closures, near, GAP, 1)
+        found = plain.no_narrower(np.radians(narrowest), np.array([alone]))
+        np.testing.assert_array_equal(found.has_any, plain.has_any)
+        for width, before, after in zip(REPEAT_DEG, plain.density[0, :, 0], found.density[0, :, 0], strict=False):
+            if width >= narrowest:
+                assert after == pytest.approx(before)
+            elif width <= narrowest / 2:
+                assert after == alone
+            else:
+                share = 1 - np.log2(narrowest / width)
+                assert after == pytest.approx(share * before + (1 - share) * alone)
+        np.testing.assert_allclose(found.density[:, -1], found.density[:, :-1].mean(axis=1))

@@ -258,8 +258,8 @@ def false_density(
     is_one = is_false[rows] if both_sides else None
     between = places_near(problem.detected[false], problem.detected[rows], is_one)
     closures, near = Closures(older, newer, turn, is_told), Near(rows, false, between)
-    repeated = repeats(closures, near, problem.priors.run_gap_steps, k, off.least_between_repeats)
-    return FalseDensity(alone, repeated, run)
+    repeated = repeats(closures, near, problem.priors.run_gap_steps, k)
+    return FalseDensity(alone, repeated.no_narrower(off.least_between_repeats, alone.mean(axis=0)), run)
 
 
 def _near_miss_shares(priors: SlamPriors) -> np.ndarray:
