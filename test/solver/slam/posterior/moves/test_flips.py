@@ -13,12 +13,12 @@ from ..planar import problem_of, state_of, yaw
 
 
 def test_closures_that_only_each_other_make_false_are_believed_together() -> None:
-    """Three good ones 3.5° off: as false ones they repeat each other's turn, so that each by itself stays false."""
+    """Three good ones 4° off: as false ones they repeat each other's turn, so that each by itself stays false."""
     rng = np.random.default_rng(0)
     count, older = 240, np.arange(0, 100, 4)
     off = np.radians(rng.normal(0, 1.5, len(older)))
     doubted = np.arange(1, 13, 4)
-    off[doubted] = np.radians(3.5) + np.radians(rng.normal(0, 0.2, len(doubted)))
+    off[doubted] = np.radians(4.0) + np.radians(rng.normal(0, 0.2, len(doubted)))
     graph = ViewGraph.create(
         np.concatenate((np.arange(count), older)),
         np.concatenate((np.arange(1, count + 1), older + 120)),
