@@ -125,6 +125,7 @@ class InnerNodes:
         here, end = _inner_points(problem, nodes, node), _ends(problem, nodes.way, segment)
         of_shift = pose.solved.covariance[segment]
         told = _covariance(pose, nodes.way, segment, here, end)[:, :, -m:]
+        told[problem.slipped[segment]] = 0.0  # at which step is not known, so the row tells nothing of the inside
         gain = np.linalg.solve(of_shift, told.transpose(0, 2, 1)).transpose(0, 2, 1)
         left = _covariance(pose, nodes.way, segment, here, here) - gain @ told.transpose(0, 2, 1)
         return cls(node, segment, here, gain, _from_ends(problem, nodes.way, (node, segment, here), gain), left)
