@@ -72,3 +72,10 @@ def test_the_segment_is_found_and_no_good_closure_pays_for_it(seed: int) -> None
     flagged = (solution.outlier_score > 0.5) & ~graph.is_odometry
     assert float(errors.mean()) < 2.0
     assert torch.equal(flagged, is_false)
+
+
+def test_inside_the_segment_every_position_has_a_variance() -> None:
+    """The slip bends the segment by far more than a linearisation about odometry holds for."""
+    graph, _, _ = slipping_walk(5)
+    uncertainty = solve(graph).position_uncertainty
+    assert uncertainty is not None and bool((uncertainty[1:] > 0).all())

@@ -104,6 +104,7 @@ class InnerNodes:
     Attributes:
         node, segment: ``(n,)``.
         points: where in these they lie.
+        of_shift: ``(n, m, m)`` m², C of their segments.
         gain: ``(n, d, m)`` G.
         jacobian: ``(n, d, 3 d)`` how turns and positions depend on the blocks of their segment's row.
         left: ``(n, d, d)`` their covariance if the key nodes are given.
@@ -112,6 +113,7 @@ class InnerNodes:
     node: np.ndarray
     segment: np.ndarray
     points: _Points
+    of_shift: np.ndarray
     gain: np.ndarray
     jacobian: np.ndarray
     left: np.ndarray
@@ -123,17 +125,17 @@ class InnerNodes:
         node = np.flatnonzero(problem.segment_of_node >= 0)
         segment = problem.segment_of_node[node]
         here, end = _inner_points(problem, nodes, node), _ends(problem, nodes.way, segment)
-        of_shift = pose.solved.covariance[segment]
+        # C along the bent way, as all else here: a slip bends a segment so far that the row's own one is another.
+        of_shift = _covariance(pose, nodes.way, segment, end, end)[:, -m:, -m:]
         told = _covariance(pose, nodes.way, segment, here, end)[:, :, -m:]
-        told[problem.slipped[segment]] = 0.0  # at which step is not known, so the row tells nothing of the inside
         gain = np.linalg.solve(of_shift, told.transpose(0, 2, 1)).transpose(0, 2, 1)
         left = _covariance(pose, nodes.way, segment, here, here) - gain @ told.transpose(0, 2, 1)
-        return cls(node, segment, here, gain, _from_ends(problem, nodes.way, (node, segment, here), gain), left)
+        jacobian_of = _from_ends(problem, nodes.way, (node, segment, here), gain)
+        return cls(node, segment, here, of_shift, gain, jacobian_of, left)
 
     def left_with(self, pose: PoseMode, way: Displacements, some: np.ndarray, others: np.ndarray) -> np.ndarray:
         """``(q, d, d)`` as :attr:`left`, of some ``(q,)`` of the n nodes with others ``(q,)`` of the same segments."""
-        segment = self.segment[some]
-        of_shift = pose.solved.covariance[segment]
+        segment, of_shift = self.segment[some], self.of_shift[some]
         one, other = (_Points(*(value[each] for value in self.points)) for each in (some, others))
         prior = _covariance(pose, way, segment, one, other)
         return np.asarray(prior - self.gain[some] @ of_shift @ self.gain[others].transpose(0, 2, 1))
