@@ -38,7 +38,9 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.sfm.noise_density import NoiseDensity
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape
 from rotavg_ros.solver.sfm.priors import RefinementPriors
-from rotavg_ros.solver.sfm.step import Measure, Problem, Structure, l1_weight, l_half_weight
+from rotavg_ros.solver.sfm.step.measure import Measure, l1_weight, l_half_weight
+from rotavg_ros.solver.sfm.step.problem import Problem
+from rotavg_ros.solver.sfm.step.structure import Structure
 from rotavg_ros.solver.sfm.symmetric_rows import distinct_entries, turned
 from rotavg_ros.view_graph import ViewGraph
 

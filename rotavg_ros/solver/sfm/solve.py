@@ -37,7 +37,7 @@ from rotavg_ros.solver.sfm.starts.choice import Start, begin, settle_best
 from rotavg_ros.solver.sfm.starts.others import other_starts
 from rotavg_ros.solver.sfm.starts.parts import Parts
 from rotavg_ros.solver.sfm.stated.noise import StatedNoise
-from rotavg_ros.solver.sfm.step import Structure, accepted_edges
+from rotavg_ros.solver.sfm.step.structure import Structure, accepted_edges
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # For graphs with more edges it pays to measure which tile sizes are fastest on this machine.

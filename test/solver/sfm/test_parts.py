@@ -18,7 +18,7 @@ from rotavg_ros.solver.sfm.refinement import EdgeWeights
 from rotavg_ros.solver.sfm.starts import parts
 from rotavg_ros.solver.sfm.starts.choice import Start, begin, settle_best
 from rotavg_ros.solver.sfm.starts.parts import Parts
-from rotavg_ros.solver.sfm.step import Structure
+from rotavg_ros.solver.sfm.step.structure import Structure
 from test.solver.graphs import as_quaternions, measured, random_truth
 
 PRIORS = RefinementPriors()

@@ -19,7 +19,9 @@ from rotavg_ros.solver.sfm import refinement
 from rotavg_ros.solver.sfm.laplacians import block
 from rotavg_ros.solver.sfm.laplacians.block import Arrivals, BlockLaplacian, SplitWeights, factorised
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape, scatter
-from rotavg_ros.solver.sfm.step import Measure, Problem, Structure, l1_weight
+from rotavg_ros.solver.sfm.step.measure import Measure, l1_weight
+from rotavg_ros.solver.sfm.step.problem import Problem
+from rotavg_ros.solver.sfm.step.structure import Structure
 from rotavg_ros.view_graph import EdgeLabel
 from test.solver.graphs import as_quaternions, measured, random_truth
 

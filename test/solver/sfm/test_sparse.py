@@ -15,7 +15,7 @@ from rotavg_ros.solver.neurora.tree import bootstrap
 from rotavg_ros.solver.sfm.refinement import EdgeWeights, refine
 from rotavg_ros.solver.sfm.starts.choice import Start, begin, settle_best
 from rotavg_ros.solver.sfm.starts.spectral import spectral
-from rotavg_ros.solver.sfm.step import Structure
+from rotavg_ros.solver.sfm.step.structure import Structure
 from test.solver.graphs import as_quaternions, measured, random_truth
 
 

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros import Solution, ViewGraph, rotations, solve
 from rotavg_ros.solver.sfm import refinement
-from rotavg_ros.solver.sfm.step import Problem, Structure
+from rotavg_ros.solver.sfm.step.problem import Problem
+from rotavg_ros.solver.sfm.step.structure import Structure
 from test.solver.graphs import as_quaternions, random_truth
 from test.solver.sfm.test_sparse import anyhow
 

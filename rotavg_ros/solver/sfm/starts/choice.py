@@ -20,7 +20,8 @@ from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.refinement import PRIORS, EdgeWeights, coarse_steps, settle, shaped_steps
 from rotavg_ros.solver.sfm.starts.parts import Parts
-from rotavg_ros.solver.sfm.step import Problem, Structure
+from rotavg_ros.solver.sfm.step.problem import Problem
+from rotavg_ros.solver.sfm.step.structure import Structure
 from rotavg_ros.view_graph import ViewGraph
 
 

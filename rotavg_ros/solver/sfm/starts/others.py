@@ -17,7 +17,8 @@ from rotavg_ros.solver.sfm.cycles.evidence import by_triangles
 from rotavg_ros.solver.sfm.refinement import PRIORS, coarse_steps
 from rotavg_ros.solver.sfm.starts.choice import Start
 from rotavg_ros.solver.sfm.starts.spectral import spectral
-from rotavg_ros.solver.sfm.step import Problem, Structure
+from rotavg_ros.solver.sfm.step.problem import Problem
+from rotavg_ros.solver.sfm.step.structure import Structure
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 

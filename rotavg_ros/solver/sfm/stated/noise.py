@@ -22,7 +22,7 @@ from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.refinement import EdgeWeights
 from rotavg_ros.solver.sfm.stated.precision import Residuals, relative_variance, stated_sizes
 from rotavg_ros.solver.sfm.stated.shape import FramedResiduals, believed_units
-from rotavg_ros.solver.sfm.step import Structure
+from rotavg_ros.solver.sfm.step.structure import Structure
 from rotavg_ros.view_graph import ViewGraph
 
 

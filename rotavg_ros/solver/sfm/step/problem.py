@@ -1,10 +1,8 @@
-"""One least-squares step of the SfM refinement: residuals, robust weights, and the linear system."""
+"""A graph's least-squares steps."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,160 +10,22 @@ import torch
 from torch import Tensor
 
 from rotavg_ros.solver.algebra.canonical_form import evenly_spread
-from rotavg_ros.solver.algebra.relaxed_forest import cheapest_forest
-from rotavg_ros.solver.algebra.residuals import SLICE_EDGES, EdgeResiduals
-from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
+from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.neurora.numbers import NUMBERS
-from rotavg_ros.solver.running.threads import for_each, slices, stretches
-from rotavg_ros.solver.sfm.laplacians.block import Arrivals, BlockLaplacian, Laplacian, SplitWeights, factorised
+from rotavg_ros.solver.sfm.laplacians.block import Arrivals, BlockLaplacian, Laplacian, factorised
 from rotavg_ros.solver.sfm.laplacians.edge import EdgeLaplacian, MatrixWeights
 from rotavg_ros.solver.sfm.laplacians.groups import WAYS, Group, Way
 from rotavg_ros.solver.sfm.noise_density import NoiseDensity
-from rotavg_ros.solver.sfm.noise_shape import NoiseShape, ResidualSample, ShapeEstimator, share_of_first
+from rotavg_ros.solver.sfm.noise_shape import NoiseShape, ResidualSample, ShapeEstimator
 from rotavg_ros.solver.sfm.priors import RefinementPriors
-from rotavg_ros.solver.sfm.series import EdgesInSeries
-from rotavg_ros.solver.sfm.symmetric_rows import distinct_entries, full, times, turned
-from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+from rotavg_ros.solver.sfm.step.measure import Expected, Measure, dot
+from rotavg_ros.solver.sfm.step.pull import pulled
+from rotavg_ros.solver.sfm.step.structure import Structure
+from rotavg_ros.solver.sfm.symmetric_rows import times
+from rotavg_ros.view_graph import ViewGraph
 
-
-@dataclass(frozen=True)
-class Structure:
-    """What is known of a graph's connections (N nodes in C components).
-
-    Attributes:
-        component: ``(N,)`` connected components.
-        roots: ``(C,)`` one node of each component, in the components' order; it is held fixed.
-        edges: the graph's edges, sorted.
-        series: edges that only check each other.
-        accepted: ``(A,)`` edges that the user has accepted.
-    """
-
-    component: Tensor
-    roots: Tensor
-    edges: SortedEdges
-    series: EdgesInSeries
-    accepted: Tensor
-
-    @classmethod
-    def of(cls, graph: ViewGraph, component: Tensor | None = None) -> Structure:
-        """Computed from a graph; a component's root is its first node."""
-        component = graph.components() if component is None else component
-        edges = SortedEdges.of(graph)
-        nodes = torch.arange(graph.num_nodes, device=graph.device)
-        roots = nodes.new_full((int(component.max()) + 1,), graph.num_nodes)
-        roots = roots.scatter_reduce(0, component, nodes, "amin")
-        forest = cheapest_forest(graph, edges, torch.ones_like(graph.precision), roots, component)
-        series = EdgesInSeries.of(graph, forest.parent, forest.parent_edge)
-        return cls(component, roots, edges, series, accepted_edges(graph))
-
-    def redundancy(self, graph: ViewGraph) -> Tensor:
-        """Number of edges of each component beyond a spanning tree, ``(C,)``."""
-        nodes = torch.bincount(self.component, minlength=len(self.roots))
-        if len(self.roots) == 1:
-            return graph.num_edges - nodes + 1
-        edges = torch.bincount(self.component.index_select(0, graph.source), minlength=len(self.roots))
-        return edges - nodes + 1
-
-
-class Measure(NamedTuple):
-    """How residuals are measured and weighted.
-
-    Attributes:
-        shape: shape of the noise.
-        variance: ``(N,)`` variances of the nodes, in units of the shape; without numerical floors.
-        weigh: function (expected squared residuals of edges, which edges these are) → robust weights.
-        is_single: ``(C,)`` bool, components whose residuals and systems are in single precision if they are well knit;
-            elsewhere precision is double. In NumPy, so that a step does not wait for an accelerator.
-        source_share: ``(M,)`` probability that each edge's noise is in its source's frame; None: from residuals.
-        unit: ``(6, M)`` entries of T in the world's frame: residuals r count as T r (``stated/shape.py``), and the
-            noise's shape is that of T r; None: T = 1.
-        is_held: ``(M,)`` bool, edges that have their ``source_share``, if there is one; others' is from residuals.
-            None: all.
-    """
-
-    shape: NoiseShape
-    variance: Tensor
-    weigh: Callable[[Tensor, slice | Tensor], Tensor]
-    is_single: np.ndarray
-    source_share: Tensor | None = None
-    unit: Tensor | None = None
-    is_held: Tensor | None = None
-
-    def in_units(self, vector: Tensor, edges: slice | Tensor) -> Tensor:
-        """``T r`` of some edges with residuals ``(3, k)``; or ``T`` times their pulls."""
-        return vector if self.unit is None else times(self.unit[:, edges].to(vector), vector)
-
-    def of(self, group: Group) -> Measure:
-        """The same for the edges of a group alone."""
-        edge = group.edge
-        if edge is None:
-            return self
-        share, unit, is_held = (
-            None if value is None else group.of(value) for value in (self.source_share, self.unit, self.is_held)
-        )
-        return self._replace(
-            weigh=lambda square, edges: self.weigh(square, edge[edges]), source_share=share, unit=unit, is_held=is_held
-        )
-
-    def rows(self, dtype: torch.dtype) -> Tensor:
-        """The nodes' values used by their edges, ``(k, N)``: variance and, unless noise is round, six shape entries."""
-        variance = self.variance[None]
-        if self.shape.covariance is None:
-            return variance.to(dtype)
-        return torch.cat((variance, distinct_entries(self.shape.information))).to(dtype)
-
-
-class Expected(NamedTuple):
-    """Residuals ``(3, k)`` as measured by a :class:`Measure`.
-
-    Attributes:
-        pull: ``(3, k)`` Ω r.
-        square: ``(k,)`` rᵀ Ω r.
-        variance: ``(k,)`` sum over both ends.
-        source_share: ``(k,)`` probability that the noise is in the source's frame; Ω is the mean of both ends'.
-    """
-
-    pull: Tensor
-    square: Tensor
-    variance: Tensor
-    source_share: Tensor
-
-    @staticmethod
-    def information(at_source: Tensor, at_target: Tensor, source_share: Tensor) -> Tensor:
-        """Ω ``(3, 3, k)``, given :meth:`Measure.rows` of both ends and the share."""
-        if len(at_source) == 1:
-            unit = torch.eye(3, dtype=at_source.dtype, device=at_source.device)
-            return unit[:, :, None].expand(3, 3, len(source_share))
-        return full(torch.lerp(at_target[1:], at_source[1:], source_share))
-
-    @classmethod
-    def of(
-        cls,
-        vector: Tensor,
-        at_source: Tensor,
-        at_target: Tensor,
-        source_share: Tensor | None = None,
-        is_held: Tensor | None = None,
-    ) -> Expected:
-        """From residuals, given :meth:`Measure.rows` of both ends, and the source share where it is held fixed.
-
-        Args:
-            is_held: ``(k,)`` bool, edges whose source share is held; None: all.
-        """
-        variance = at_source[0] + at_target[0]
-        if len(at_source) == 1:  # noise is round: Ω = 1
-            square = _dot(vector, vector)
-            return cls(vector, square, variance, torch.full_like(square, 0.5))
-        if source_share is not None and is_held is None:
-            pull = times(torch.lerp(at_target[1:], at_source[1:], source_share), vector)
-            return cls(pull, _dot(vector, pull), variance, source_share)
-        pulls = [times(end[1:], vector) for end in (at_source, at_target)]
-        squares = [_dot(vector, pull) for pull in pulls]
-        share = share_of_first(*squares)
-        if source_share is not None and is_held is not None:
-            share = torch.where(is_held, source_share, share)
-        square = torch.lerp(squares[1], squares[0], share)
-        return cls(torch.lerp(pulls[1], pulls[0], share), square, variance, share)
+# Groups of components change while components converge, one after the other.
+_KEPT_GROUPS = 4
 
 
 class Step(NamedTuple):
@@ -202,24 +62,6 @@ class Step(NamedTuple):
             torch.where(chosen, other.decrement, self.decrement),
             torch.where(of_node[source], other.source_share, self.source_share),
         )
-
-
-class Pull(NamedTuple):
-    """Weights and forces of the edges at given orientations.
-
-    Attributes:
-        weights: the edges' robust weights.
-        matrix: ``(6, M)`` entries of the weights times the noise's shape, where edges have units of their own.
-        force: ``(3, N)`` sum of the weighted residuals at each node.
-    """
-
-    weights: SplitWeights
-    matrix: Tensor | None
-    force: Tensor
-
-
-# Groups of components change while components converge, one after the other.
-_KEPT_GROUPS = 4
 
 
 class Problem:
@@ -283,7 +125,7 @@ class Problem:
     def typical(self, sample: ResidualSample) -> Tensor:
         """Geometric mean of some residuals' lengths in each component, ``(C,)`` rad."""
         least = self.priors.least_residual
-        logarithm = _dot(sample.vector, sample.vector).clamp(min=least**2).log() / 2
+        logarithm = dot(sample.vector, sample.vector).clamp(min=least**2).log() / 2
         return torch.exp(self._sum_of_some(logarithm) / self._count_of_some)
 
     def cost(self, orientations: Tensor, weight: Tensor) -> Tensor:
@@ -417,7 +259,7 @@ class Problem:
         That is ``(C,)`` bool; None: everywhere.
         """
         graph, measure = group.graph, measure.of(group)
-        weights, matrix, force = _pull(group, orientations, measure, group.of(prior), way.dtype)
+        weights, matrix, force = pulled(group, orientations, measure, group.of(prior), way.dtype)
         force *= is_open[self.component]
         system: Laplacian
         if matrix is None:
@@ -437,64 +279,3 @@ class Problem:
         turn = (turn - turn[:, self.roots[self.component]]).double()
         share = group.among_all(weights.source_share, self.graph.num_edges)
         return Step(turn, system.weight_sum.double(), self.sum(decrement), share), is_solved
-
-
-def _pull(group: Group, orientations: Tensor, measure: Measure, prior: Tensor, dtype: torch.dtype) -> Pull:
-    """At orientations ``(N, 4)``, given the group's own measure and prior weights ``(K,)``."""
-    graph = group.graph
-    measured = group.measured if dtype == torch.float32 else None
-    residuals = EdgeResiduals(graph, orientations.to(dtype), measured)
-    rows, prior = measure.rows(dtype), prior.to(dtype)
-    held = None if measure.source_share is None else measure.source_share.to(dtype)
-    is_held = measure.is_held
-    share = torch.empty_like(prior) if held is None or is_held is not None else held
-    weights = SplitWeights(torch.empty_like(prior), share)
-    matrix = None if measure.unit is None else prior.new_empty(6, graph.num_edges)
-    parts = stretches(slices(graph.num_edges, SLICE_EDGES, graph.device))
-    # Components in rows: adding columns up by node is a dozen times as fast as adding up rows.
-    forces = [rows.new_zeros(3, graph.num_nodes) for _ in parts]
-
-    def walk(part: int) -> None:
-        for edges in parts[part]:
-            source, target = graph.source[edges], graph.target[edges]
-            at_source, at_target = rows.index_select(1, source), rows.index_select(1, target)
-            vector = measure.in_units(residuals.vectors(edges), edges)
-            shares = (None if value is None else value[edges] for value in (held, is_held))
-            expected = Expected.of(vector, at_source, at_target, *shares)
-            robust = measure.weigh(expected.square + expected.variance, edges).mul_(prior[edges])
-            weights.total[edges] = robust
-            if share is not held:
-                weights.source_share[edges] = expected.source_share
-            pull = measure.in_units(expected.pull.mul_(robust), edges)
-            if matrix is not None and measure.unit is not None:
-                information = Expected.information(at_source, at_target, expected.source_share)
-                in_world = turned(information, full(measure.unit[:, edges].to(dtype)))
-                matrix[:, edges] = robust * distinct_entries(in_world)
-            forces[part].index_add_(1, target, pull)
-            forces[part].index_add_(1, source, pull.neg_())  # with alpha = -1 it takes six times as long
-
-    for_each(walk, range(len(parts)))
-    return Pull(weights, matrix, torch.stack(forces).sum(dim=0))
-
-
-def accepted_edges(graph: ViewGraph) -> Tensor:
-    """Indices ``(A,)`` of the edges that the user has accepted."""
-    return (graph.label == EdgeLabel.ACCEPTED).nonzero()[:, 0]
-
-
-def l1_weight(squared_residual: Tensor, _: slice | Tensor) -> Tensor:
-    """Weight of the ℓ1 cost, of squared residuals s = |r|²: s^(−1/2) = |r|⁻¹."""
-    return squared_residual.rsqrt()
-
-
-def l_half_weight(squared_residual: Tensor, _: slice | Tensor) -> Tensor:
-    """Weight of the ℓ½ cost, of squared residuals s = |r|²: s^(−3/4) = |r|^(−3/2).
-
-    Two roots take a fifth of the time of a power.
-    """
-    return (squared_residual * squared_residual.sqrt()).rsqrt_()
-
-
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Inner products ``(k,)`` of columns ``(3, k)``, a third faster than a sum over rows."""
-    return torch.mul(a[0], b[0]).addcmul_(a[1], b[1]).addcmul_(a[2], b[2])

@@ -1,0 +1,1 @@
+"""One least-squares step of the SfM refinement: residuals, robust weights, and the linear system."""
