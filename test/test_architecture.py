@@ -177,7 +177,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "rows": {"closures", "displacements", "problem", "row_errors", "state"},
         "repeats": {"closures", "priors", "problem"},
         "places": {"closures", "priors", "repeats"},
-        "solved": {"closures", "displacements", "problem", "repeats", "state"},
+        "solved": {"closures", "displacements", "problem", "repeats", "rows", "state"},
         "em": {
             *("closures", "displacements", "even", "places", "problem", "repeats", "row_errors", "rows"),
             *("solved", "state"),

@@ -11,6 +11,7 @@ from rotavg_ros.solver.slam.poses.closures import Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.displacements import Displacements
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
+from rotavg_ros.solver.slam.poses.rows import Arms
 from rotavg_ros.solver.slam.poses.state import PoseState
 
 
@@ -21,6 +22,7 @@ class Solved:
     Attributes:
         state: the state after the step, with the noise used in it.
         way: displacements before the step.
+        arms: how the rows' shifts turn with their ends.
         covariance: ``(E, m, m)`` m², of shifts.
         rotation_weight: ``(E, 2)`` rad⁻², of turns about the drift axis and any other one.
         closure_weight: ``(C,)`` m⁻², of closures' even shifts.
@@ -36,6 +38,7 @@ class Solved:
 
     state: PoseState
     way: Displacements
+    arms: Arms
     covariance: np.ndarray
     rotation_weight: np.ndarray
     closure_weight: np.ndarray

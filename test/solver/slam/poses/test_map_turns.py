@@ -106,7 +106,7 @@ def test_density_is_one_over_all_places(case_and_pose: tuple[Case, PoseMode]) ->
     false[off] = 1.0
     false[one] = 0.0  # else it would tell others, who are what it is told by
     alone = np.full(len(false), -np.log(2 * np.pi * pose.solved.scale.extent))
-    rng, reach, draws = np.random.default_rng(0), 60.0, 20_000
+    rng, reach, draws = np.random.default_rng(0), 60.0, 40_000
     axes = maps.bases[1]
     away = rng.uniform(-reach, reach, (draws, axes.shape[1]))
     count = len(false)

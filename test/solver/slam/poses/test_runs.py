@@ -110,7 +110,7 @@ def test_what_a_run_has_in_common_is_what_all_other_rows_say(seed: int) -> None:
     d, num_edges = problem.turns + problem.shifts, len(problem.drawn.source)
     turn_weight, state = solved.rotation_weight, pose.state
     root = whitening(problem, solved.covariance, turn_weight, solved.closure_root, state)
-    rows = np.matmul(root, jacobian(problem, solved.way))
+    rows = np.matmul(root, jacobian(problem, solved.arms))
     place = problem.equations.block
     dense = np.zeros((len(rows), d, problem.equations.num_blocks, d))
     for third in range(3):

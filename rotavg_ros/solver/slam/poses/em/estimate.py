@@ -43,7 +43,7 @@ from rotavg_ros.solver.slam.poses.row_errors import (
     stated_covariance,
     turn_variances,
 )
-from rotavg_ros.solver.slam.poses.rows import jacobian, residuals, root_weight, whitening
+from rotavg_ros.solver.slam.poses.rows import Arms, jacobian, residuals, root_weight, whitening
 from rotavg_ros.solver.slam.poses.solved import PoseMode, Solved
 from rotavg_ros.solver.slam.poses.state import PoseState
 
@@ -133,7 +133,8 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     rotation_weight[closure] = places.rotation_weight[:, None]
     spend(_ROW * len(turned))
     root = whitening(problem, covariance, rotation_weight, places.closure_root, state)
-    rows = np.matmul(root, jacobian(problem, way))
+    arms = Arms.of(problem, state, way)
+    rows = np.matmul(root, jacobian(problem, arms))
     factor = problem.equations.factorise(rows, root_weight(problem, rotation_weight, state))
     whitened = np.matmul(root, residuals(problem, state, way)[:, :, None])
     step = factor.fit(whitened)
@@ -156,6 +157,7 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     return Solved(
         state,
         way,
+        arms,
         covariance,
         rotation_weight,
         places.weight,

@@ -54,7 +54,7 @@ def _log_det(problem: PoseProblem, solved: Solved) -> float:
         return solved.factor.log_det
     state = solved.state
     root = whitening(problem, solved.covariance, solved.rotation_weight, solved.closure_root, state)
-    rows, tied = np.matmul(root, jacobian(problem, solved.way)), root_weight(problem, solved.rotation_weight, state)
+    rows, tied = np.matmul(root, jacobian(problem, solved.arms)), root_weight(problem, solved.rotation_weight, state)
     return problem.equations.factorise(rows, tied, loose_weight(problem, solved.scale.extent)).log_det
 
 

@@ -21,7 +21,7 @@ from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.poses.displacements import Displacements
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.row_errors import bent_by, bridge_variance, segment_spread
-from rotavg_ros.solver.slam.poses.rows import crossed, jacobian
+from rotavg_ros.solver.slam.poses.rows import Arms, crossed, jacobian
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 
 _TINY = np.finfo(np.float64).tiny
@@ -217,4 +217,4 @@ def _from_ends(
     rows[:, k:, d + k : 2 * d] = np.eye(problem.shifts)
     rows[:, k:, :k] = crossed(problem, here.at_target)
     rows[:, k:, d : d + k] = crossed(problem, way.way[node] - here.at_target)
-    return np.asarray(rows + gain @ jacobian(problem, way)[segment][:, k:])
+    return np.asarray(rows + gain @ jacobian(problem, Arms(way.at_target, way.at_source))[segment][:, k:])

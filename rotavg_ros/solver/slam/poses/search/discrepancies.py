@@ -16,5 +16,5 @@ def discrepancies(pose: PoseMode, members: np.ndarray) -> tuple[np.ndarray, np.n
     own = np.repeat(closure_turns(problem, pose.state.noise)[members, None], d, axis=1)
     shared = np.where(problem.run[problem.mode.problem.closure] >= 0, pose.state.noise.common, 0.0)
     own[:, k:] = (stated_variance(problem, pose.state) - shared)[members, None]
-    total = solved.factor.covariance_between(jacobian(problem, solved.way)[rows], rows) + np.diag(own.ravel())
+    total = solved.factor.covariance_between(jacobian(problem, solved.arms)[rows], rows) + np.diag(own.ravel())
     return total, solved.predictions.mean[members].ravel()
