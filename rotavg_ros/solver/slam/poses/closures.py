@@ -12,7 +12,7 @@ from rotavg_ros.solver.slam.graph.chain_cuts import connected, joined_by_others
 from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.noise.repeats import Near, places_near
 from rotavg_ros.solver.slam.poses.even.shifts import EvenShifts
-from rotavg_ros.solver.slam.posterior.densities import log_half_turn
+from rotavg_ros.solver.slam.posterior.densities import anyhow, log_half_turn
 
 # Classes of good closures come first.
 GOOD = 2
@@ -28,8 +28,9 @@ _OTHERWISE = 0.5
 _DIMENSIONS = 3
 # A closure counts as predicted if the variance is less than this share of the uninformed one.
 _TOLD = 0.5
-# rad² per component of a turn about which nothing is known.
-ANYHOW = np.pi**2 / 3
+# Variance of the normal density whose value at zero is the mean of another one over its own values, in units of that
+# one's variance: shifts of which nothing is known are as likely wherever they lead.
+ANYWHERE = np.e
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ class Predictions:
         """
         spread = np.diagonal(self.covariance, axis1=1, axis2=2)
         turn, shift = spread[:, :turns].mean(axis=1), spread[:, turns:].mean(axis=1)
-        return np.asarray((turn < _TOLD * ANYHOW) & (shift < _TOLD * extent))
+        return np.asarray((turn < _TOLD * anyhow(turns)) & (shift < _TOLD * ANYWHERE * extent))
 
 
 def _scaled(covariance: np.ndarray, share: np.ndarray) -> np.ndarray:
@@ -191,6 +192,12 @@ class Told:
         joined = np.asarray(component[first] == component[second])
         joined[right] = joined_by_others(count, self.chains[right])
         return joined
+
+    def alike_in(self, which: np.ndarray) -> np.ndarray:
+        """``(C,)`` number of closures ``which``, ``(C,)`` bool, between the same two chains as each."""
+        first, second = np.sort(self.chains, axis=1).T
+        pair = np.unique(first * (int(self.chains.max(initial=0)) + 1) + second, return_inverse=True)[1]
+        return np.asarray(np.bincount(pair, which)[pair])
 
     def detected_near(self, rows: np.ndarray, tells: np.ndarray, *, in_order: bool) -> Near:
         """For some closures, those of the others detected shortly before or after them, never themselves.

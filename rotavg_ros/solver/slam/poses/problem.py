@@ -14,12 +14,12 @@ from rotavg_ros.solver.algebra.sparse.block_system import BlockEquations
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.graph.routes import way_along
-from rotavg_ros.solver.slam.poses.closures import ANYHOW, Told
+from rotavg_ros.solver.slam.poses.closures import Told
 from rotavg_ros.solver.slam.poses.displacements import Displacements, DrawnSteps
 from rotavg_ros.solver.slam.poses.even.turns import EvenTurns
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 from rotavg_ros.solver.slam.poses.state import PoseState
-from rotavg_ros.solver.slam.posterior.densities import log_false, log_good
+from rotavg_ros.solver.slam.posterior.densities import anyhow, log_false, log_good
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.rows import tails, variances
 from rotavg_ros.solver.slam.posterior.state import RUN_STEPS
@@ -286,7 +286,7 @@ class PoseProblem:
             false_odds = np.where(label == 0, good - left_out.log_odds[closure], 0.0)
         # A similar-looking place is seen at nearly the angle at which the true one would be, which may be uncertain.
         priors = problem.priors
-        broad = predicted / (1 + predicted / ANYHOW)
+        broad = predicted / (1 + predicted / anyhow(k))
         false_odds += log_false(square, k, priors, predicted=broad) - log_false(square, k, priors)
         is_known = np.isfinite(self.translation).all(axis=1)[self.closures]
         own = self.own[closure] / state.others.relative[closure]

@@ -8,11 +8,12 @@ import numpy as np
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
-from rotavg_ros.solver.slam.poses.closures import ANYHOW
+from rotavg_ros.solver.slam.poses.closures import ANYWHERE
 from rotavg_ros.solver.slam.poses.displacements import Displacements
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.row_errors import common_turn
 from rotavg_ros.solver.slam.poses.state import PoseState
+from rotavg_ros.solver.slam.posterior.densities import anyhow
 
 # Stiffness of the roots, relative to the stiffest row.
 _GROUNDING = 1e6
@@ -116,7 +117,8 @@ def whitening(
 
 def loose_weight(problem: PoseProblem, extent: float) -> np.ndarray:
     """``(d,)`` weight of chains that nothing joins: any turn, and anywhere on a map of ``extent`` m²."""
-    return np.concatenate((np.full(problem.turns, 1 / ANYHOW), np.full(problem.shifts, 1 / extent)))
+    turn, shift = anyhow(problem.turns), ANYWHERE * extent
+    return np.concatenate((np.full(problem.turns, 1 / turn), np.full(problem.shifts, 1 / shift)))
 
 
 def root_weight(problem: PoseProblem, rotation_weight: np.ndarray, state: PoseState) -> np.ndarray:

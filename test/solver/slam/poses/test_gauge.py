@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
+from rotavg_ros import solve
 from rotavg_ros.solver.slam.poses.rows import Arms, jacobian
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
@@ -32,14 +34,43 @@ def test_a_turn_of_everything_changes_no_row(options: dict[str, object]) -> None
         np.testing.assert_allclose(change, 0.0, atol=1e-9 * np.abs(state.position).max())
 
 
+def joined_by_one_closure() -> ViewGraph:
+    town = in_a_town(0, good=1)
+    return town.graph.select_edges(torch.from_numpy(~town.is_false))
+
+
+def between_robots(graph: ViewGraph) -> np.ndarray:
+    """The edges ``(n,)`` that join two robots."""
+    return np.flatnonzero((graph.source < LENGTH) != (graph.target < LENGTH))
+
+
 def test_nothing_predicts_the_only_closure_that_joins_a_robot() -> None:
     """Residuals of the robot's own odometry seemed to hold it to 23° and less."""
-    town = in_a_town(0, good=1)
-    first, second = (town.graph.source < LENGTH, town.graph.target < LENGTH)
-    joins = (first != second) & torch.from_numpy(~town.is_false)
-    kept = (first == second) | joins
-    graph: ViewGraph = town.graph.select_edges(kept)
-    assert ((graph.kind == EdgeKind.LOOP_CLOSURE) & ((graph.source < LENGTH) != (graph.target < LENGTH))).sum() == 1
+    graph = joined_by_one_closure()
+    assert len(between_robots(graph)) == 1
     pose = pose_mode(graph)
     join = np.flatnonzero(~pose.problem.within_chain)
     np.testing.assert_allclose(pose.solved.factor.redundancy[pose.problem.mode.problem.closure[join]], 0.0, atol=1e-6)
+
+
+def test_the_only_closure_that_joins_a_robot_is_false_as_often_as_others() -> None:
+    """And the robot is known no better than that. Its score was .01, however many others were false."""
+    before, rng, count = joined_by_one_closure(), np.random.default_rng(0), 30
+    first = LENGTH * rng.integers(0, 2, count)
+    source, target = first + rng.integers(0, LENGTH // 2, count), first + rng.integers(LENGTH // 2, LENGTH, count)
+    turn = Rotation.from_rotvec(np.outer(rng.uniform(-np.pi, np.pi, count), [0, 0, 1.0]))
+    assert before.translation is not None
+    graph = ViewGraph.create(
+        np.r_[before.source, source],
+        np.r_[before.target, target],
+        target_from_source=np.r_[before.target_from_source.numpy(), turn.as_quat()],
+        translation=np.r_[before.translation.numpy(), np.c_[rng.normal(0, 1, (count, 2)), np.zeros(count)]],
+        kind=np.r_[before.kind.numpy(), np.full(count, EdgeKind.LOOP_CLOSURE)],
+        num_nodes=before.num_nodes,
+    )
+    solution = solve(graph)
+    score, closures = solution.outlier_score.numpy(), int((graph.kind == EdgeKind.LOOP_CLOSURE).sum())
+    assert (score[-count:] > 0.9).sum() > 0.9 * count
+    (join,) = between_robots(graph)
+    assert 0.5 * count / closures < score[join] < 1.5 * count / closures
+    assert np.degrees(float(solution.uncertainty[LENGTH:].min())) > 20

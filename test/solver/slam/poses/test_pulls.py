@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from rotavg_ros.solver.slam.poses.closures import ANYHOW, GOOD, Predictions, Scale, Told
+from rotavg_ros.solver.slam.poses.closures import ANYWHERE, GOOD, Predictions, Scale, Told
 from rotavg_ros.solver.slam.poses.even.shifts import EvenShifts
 from rotavg_ros.solver.slam.poses.places.classes import CLASSES, Said
 from rotavg_ros.solver.slam.poses.places.pulls import pulled
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
+from rotavg_ros.solver.slam.posterior.densities import anyhow
 
 
 def told(count: int) -> Told:
@@ -105,15 +106,30 @@ def test_places_anywhere_are_as_likely_wherever_the_map_has_them() -> None:
     np.testing.assert_allclose(near, -multivariate_normal(np.zeros(2), 2500.0 * np.eye(2)).entropy())
 
 
-def test_a_false_rotation_is_not_in_place_where_no_place_is_known() -> None:
+def test_one_false_rotation_may_be_in_place_where_no_place_is_known() -> None:
     """A hundred closures of a robot that nothing else joins cannot all be in place: there is but one for the robot."""
     known, scale = said_of(1, 0.0), alike(1, variance=0.01, extent=2500.0)
     assert known.log_in_place[0] > known.log_anywhere[0] + 5
-    loose = Predictions(np.zeros((1, 3)), np.diag([3.0, 2000.0, 2000.0])[None])
-    joined = np.ones(1, dtype=bool)
-    assert Said.of(loose, told(1), joined, 1, scale, PlacePriors()).log_in_place[0] == -np.inf
-    # Nor where only wrong ones would tell of a place.
-    assert Said.of(known.predictions, told(1), ~joined, 1, scale, PlacePriors()).log_in_place[0] == -np.inf
+    loose, told_of = Predictions(np.zeros((1, 3)), np.diag([6.0, 6000.0, 6000.0])[None]), np.ones(1, dtype=bool)
+    said = Said.of(loose, told(1), told_of, 1, scale, PlacePriors())
+    np.testing.assert_allclose(said.log_in_place, said.log_anywhere)
+    # Nor is a place known of which only wrong ones would tell.
+    np.testing.assert_allclose(
+        Said.of(known.predictions, told(1), ~told_of, 1, scale, PlacePriors()).log_in_place, said.log_anywhere
+    )
+    many = Predictions(np.repeat(loose.mean, 100, axis=0), np.repeat(loose.covariance, 100, axis=0))
+    scale, told_of = alike(100, variance=0.01, extent=2500.0), np.ones(100, dtype=bool)
+    said = Said.of(many, told(100), told_of, 1, scale, PlacePriors())
+    np.testing.assert_allclose(said.log_in_place, said.log_anywhere - np.log(100))
+
+
+def test_what_nothing_predicts_is_as_likely_right_as_anywhere() -> None:
+    unknown = np.diag([1e9, 1e9, 1e9])[None]
+    extent, one = 2500.0, np.zeros(1, dtype=bool)
+    loose = Predictions(np.zeros((1, 3)), unknown).bounded(1, anyhow(1), np.array([ANYWHERE * extent]), one)
+    said = Said.of(loose, told(1), one, 1, alike(1, variance=1e-4, extent=extent), PlacePriors())
+    np.testing.assert_allclose(said.log_turn[0], -np.log(2 * np.pi), atol=1e-4)
+    np.testing.assert_allclose(said.log_shift[0], said.log_anywhere, atol=1e-4)
 
 
 def test_wrong_closures_are_judged_without_what_two_chains_share() -> None:
@@ -122,14 +138,14 @@ def test_wrong_closures_are_judged_without_what_two_chains_share() -> None:
     mean = np.array([[0.0, 0.1, 0.1], [0.0, 0.1, 0.1], [0.5, 8.0, 1.0], [1.0, 300.0, 1.0]])
     within = np.array([True, True, False, False])
     all_else = Predictions(mean, deviation[:, :, None] ** 2 * np.eye(3))
-    bounded = all_else.bounded(1, ANYHOW, np.full(4, 2500.0), within)
+    bounded = all_else.bounded(1, 10.0, np.full(4, 2500.0), within)
     spread = np.sqrt(np.diagonal(bounded.wrong.covariance, axis1=1, axis2=2))
     np.testing.assert_allclose(spread[2], [0.01, 0.1, 0.1])
     np.testing.assert_allclose(bounded.wrong.mean[2], mean[2])  # not drawn towards what it says itself
-    np.testing.assert_allclose(spread[3], [np.sqrt(ANYHOW), 50.0, 50.0], rtol=1e-3)
+    np.testing.assert_allclose(spread[3], [np.sqrt(10.0), 50.0, 50.0], rtol=1e-3)
     # Right ones pay for what is unknown of the place.
     assert np.sqrt(bounded.covariance[2, 1, 1]) > 4.9
-    alone = all_else.bounded(1, ANYHOW, np.full(4, 2500.0), np.ones(4, dtype=bool))
+    alone = all_else.bounded(1, 10.0, np.full(4, 2500.0), np.ones(4, dtype=bool))
     np.testing.assert_array_equal(alone.wrong.covariance, alone.covariance)
 
 

@@ -23,8 +23,9 @@ _FREE = np.array([False, False, False, True, True, False, False, False, False])
 _LEAST_RATIO, _LARGEST_RATIO = -2.0, 0.6
 # Share of the way, in the logarithm, that weights move to their targets; for alternating ones, at least the second.
 _SHARE, _LEAST_SHARE = 0.5, 0.1
-# Convergence limits: a step's root mean square in standard errors; class probabilities; logarithms of variances.
-_STEP_CONVERGED, _CHANCE_CONVERGED, _NOISE_CONVERGED = 0.05, 0.1, 0.1
+# Convergence limits: a step's root mean square in standard errors; class probabilities; logarithms of variances; and of
+# weights, times leverages.
+_STEP_CONVERGED, _CHANCE_CONVERGED, _NOISE_CONVERGED, _WEIGHT_CONVERGED = 0.05, 0.1, 0.1, 0.1
 
 
 @dataclass(frozen=True)
@@ -58,10 +59,27 @@ class Ending:
 TO_REST = Ending()
 
 
-def poses_rest(moved: float, places: Places, before: Places) -> bool:
-    """Whether the step (root mean square in standard errors) and the changes of class probabilities are negligible."""
-    changed = np.abs(places.chance - before.chance).max(initial=0.0)
-    return bool(moved < _STEP_CONVERGED and changed < _CHANCE_CONVERGED)
+def poses_rest(moved: float, places: Places, before: Places, leverage: np.ndarray) -> bool:
+    """Whether the step (root mean square in standard errors) and the changes of classes and of weights are negligible.
+
+    A weight counts by how far its closure determines itself: one that alone joins a robot moves no answer, but tells
+    how uncertain the robot is.
+
+    Args:
+        moved: the step.
+        places, before: new and previous places of C closures.
+        leverage: ``(2, C)`` of their shifts and of their turns.
+    """
+    if not moved < _STEP_CONVERGED or np.abs(places.chance - before.chance).max(initial=0.0) >= _CHANCE_CONVERGED:
+        return False
+    reweighted = _log_change(places, before)
+    return bool((np.abs(reweighted) * leverage).max(initial=0.0) < _WEIGHT_CONVERGED)
+
+
+def _log_change(places: Places, before: Places) -> np.ndarray:
+    """``(2, C)`` logarithms of the factors by which weights of shifts and of turns change."""
+    after, used = (np.stack((each.weight, each.rotation_weight)) for each in (places, before))
+    return np.asarray(np.log(after / used))
 
 
 def noise_rests(change: np.ndarray) -> bool:
@@ -97,7 +115,7 @@ class Pace:
             at_once: ``(C,)`` bool, closures that take the new weights at once.
         """
         used = np.stack((before.weight, before.rotation_weight))
-        change = np.log(np.stack((places.weight, places.rotation_weight)) / used)
+        change = _log_change(places, before)
         turns_round = change * self.change < 0
         ratio = change / np.where(turns_round, self.change, 1.0)
         share = np.where(turns_round, np.maximum(self.share / (1 - ratio), _LEAST_SHARE), _SHARE)

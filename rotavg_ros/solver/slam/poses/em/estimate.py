@@ -15,7 +15,7 @@ import numpy as np
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.sparse.block_system import BlockFactor
 from rotavg_ros.solver.running.work import spend
-from rotavg_ros.solver.slam.poses.closures import ANYHOW, Places, Predictions, Scale
+from rotavg_ros.solver.slam.poses.closures import ANYWHERE, Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.displacements import Displacements
 from rotavg_ros.solver.slam.poses.em.convergence import (
     HELD,
@@ -46,6 +46,7 @@ from rotavg_ros.solver.slam.poses.row_errors import (
 from rotavg_ros.solver.slam.poses.rows import Arms, jacobian, residuals, root_weight, whitening
 from rotavg_ros.solver.slam.poses.solved import PoseMode, Solved
 from rotavg_ros.solver.slam.poses.state import PoseState
+from rotavg_ros.solver.slam.posterior.densities import anyhow
 
 # Units of work per row, for each part of the work beside the factorisation.
 _ROW = 0.001
@@ -93,7 +94,7 @@ def estimate_poses(
         after, pace = pace.towards(replace(solved.places, chance=chance), places, at_once & (number == 0))
         noise = likeliest_noise(problem, solved).logarithms
         spend(_ROW * len(solved.left))
-        is_at_rest = poses_rest(solved.moved, after, places)
+        is_at_rest = poses_rest(solved.moved, after, places, _leverage(problem, solved))
         number += 1
         if is_at_rest:
             held = min(held, number)
@@ -146,7 +147,7 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     anywhere = _extent(problem, state) + problem.stated_square
     spend(_ROW * len(rows))
     predictions = _left_out(factor, root, left, closure)
-    predictions = predictions.bounded(problem.turns, ANYHOW, anywhere, problem.within_chain)
+    predictions = predictions.bounded(problem.turns, anyhow(problem.turns), ANYWHERE * anywhere, problem.within_chain)
     scale = _expected_scale(problem, state, predictions, way)
     judge = replace(judge, told=replace(judge.told, rotation_variance=turned[closure, 0]))
     spend(_ROW * len(rows))
@@ -170,6 +171,12 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
         maps,
         judged,
     )
+
+
+def _leverage(problem: PoseProblem, solved: Solved) -> np.ndarray:
+    """``(2, C)`` share of closures' shifts, and of their turns, that their own measurements determine, in the mean."""
+    share = np.diagonal(solved.factor.leverage[problem.mode.problem.closure], axis1=1, axis2=2)
+    return np.stack((share[:, problem.turns :].mean(axis=1), share[:, : problem.turns].mean(axis=1)))
 
 
 def _after(problem: PoseProblem, state: PoseState, step: np.ndarray) -> PoseState:

@@ -41,6 +41,7 @@ class Said:
         axes: ``(C, m, m)`` those axes of even shifts, in columns.
         anywhere: ``(C, m)`` metres and m² of shifts, marginal over turns, likewise.
         is_told: ``(C,)`` bool, whether anything that may be right predicts them.
+        untold: ``(C,)`` number of closures between the same chains that nothing predicts, at least 1.
     """
 
     predictions: Predictions
@@ -54,6 +55,7 @@ class Said:
     axes: np.ndarray
     anywhere: tuple[np.ndarray, np.ndarray]
     is_told: np.ndarray
+    untold: np.ndarray
 
     @classmethod
     def of(
@@ -80,8 +82,8 @@ class Said:
         log_turn = np.stack([here.log_turn] * GOOD + [elsewhere.log_turn] * WRONG + [repeats])
         variance = _variances(scale, priors)
         anywhere, is_told = along_axes(predictions.wrong, turns), predictions.tell(turns, scale.extent) & is_joined
-        shifts = along, spread, here.axes, anywhere
-        return cls(predictions, turns, scale, turned, variance, log_turn, *shifts, is_told)
+        shifts, untold = (along, spread, here.axes, anywhere), np.maximum(told.alike_in(told.is_known & ~is_told), 1)
+        return cls(predictions, turns, scale, turned, variance, log_turn, *shifts, is_told, untold)
 
     @cached_property
     def total(self) -> np.ndarray:
@@ -108,10 +110,11 @@ class Said:
     def log_in_place(self) -> np.ndarray:
         """``(C,)`` nats, log densities of shifts at the right place, marginal over turns.
 
-        Infinitely low if nothing tells of that place: of many such closures hardly any are there, wherever it is.
+        Where nothing tells of that place, any of them may be the one that is there, wherever that is.
         """
         along, spread = self.anywhere
-        return np.where(self.is_told, log_normal(along, spread + self.scale.own[:, None]), -np.inf)
+        unknown = self.log_anywhere - np.log(self.untold)
+        return np.where(self.is_told, log_normal(along, spread + self.scale.own[:, None]), unknown)
 
     def errors(self) -> tuple[np.ndarray, np.ndarray]:
         """``(J + 1, C)`` metres and m² per component: length of ε's mean, and its variance.
