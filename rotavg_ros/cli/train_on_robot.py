@@ -19,10 +19,9 @@ from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.results import make_folder
 from rotavg_ros.solver.learning.fine_tuning import SlamFineNet
 from rotavg_ros.solver.learning.robot_runs import RobotNoise, RobotRun
-from rotavg_ros.training.own_robot import Verdict, compare, family_of, fine_tune
+from rotavg_ros.training.own_robot import LEAST_CLOSURES, Verdict, compare, family_of, fine_tune
 from rotavg_ros.wording import counted
 
-_LEAST_CLOSURES = 12
 _TRIED = "tried"
 
 
@@ -72,9 +71,9 @@ def _read(path: Path, truth: Path | None) -> RobotRun:
         if truth is not None:
             graph_file = attach_truth(graph_file, truth)
         closures = int((~graph_file.graph.is_odometry).sum())
-        if closures < _LEAST_CLOSURES or closures == graph_file.graph.num_edges:
+        if closures < LEAST_CLOSURES or closures == graph_file.graph.num_edges:
             has = counted(closures, "closure")
-            raise OwnRobotError(f"{path}: has {has}; need odometry and {_LEAST_CLOSURES} closures at least")
+            raise OwnRobotError(f"{path}: has {has}; need odometry and {LEAST_CLOSURES} closures at least")
         known = graph_file.body_from_world_gt if truth is not None else None
         if known is not None and not np.isfinite(known).all():
             raise OwnRobotError(f"{truth}: does not tell all orientations of {path}; leave it out")

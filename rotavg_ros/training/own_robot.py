@@ -30,6 +30,9 @@ _EVEN = 0.15
 _DRAWING, _EVERY = 0.45, 8
 _LEAST_RUNS, _MOST_KEYFRAMES, _MOST_EPOCHS = 16, 800, 60
 _STANDARD_ERRORS = 2.0
+# Least number of closures of a robot's run, and of a simulated one: these are shorter than a robot's long runs, so that
+# rare closures are denser in them.
+LEAST_CLOSURES = 12
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,9 @@ def family_of(noises: Sequence[RobotNoise]) -> RobotFamily:
         planar_share=planar,
         odometry_deg=around([noise.odometry_deg for noise in noises], 1e-3, 20.0),
         closure_deg=around([noise.closure_deg for noise in noises], 1e-2, 30.0),
-        closures_per_keyframe=around([noise.closures_per_keyframe for noise in noises], 1e-3, 3.0),
+        closures_per_keyframe=around(
+            [noise.closures_per_keyframe for noise in noises], LEAST_CLOSURES / _lengths(noises)[0], 3.0
+        ),
         false_share=(max(min(false) - _SHARE, 0.0), min(max(false) + _SHARE, 0.9)),
         grouped_share=float(np.mean([noise.grouped_share for noise in noises])),
         even=0.0,
@@ -94,6 +99,12 @@ def family_of(noises: Sequence[RobotNoise]) -> RobotFamily:
     )
 
 
+def _lengths(noises: Sequence[RobotNoise]) -> tuple[int, int]:
+    """Least and largest number of keyframes of simulated runs."""
+    lengths = sorted(min(max(noise.keyframes, 60), _MOST_KEYFRAMES) for noise in noises)
+    return max(lengths[0] // 2, 50), lengths[-1]
+
+
 def fine_tune(
     family: RobotFamily, noises: Sequence[RobotNoise], folder: Path, minutes: float, told: Callable[[str], None]
 ) -> SlamFineNet:
@@ -105,10 +116,12 @@ def fine_tune(
         folder: for the weights, their card and log.
         minutes: time for everything.
         told: gets a line on the progress.
+
+    Raises:
+        DrawingError: next to no run of the family can be learned from.
     """
     begun = time.monotonic()
-    lengths = sorted(min(max(noise.keyframes, 60), _MOST_KEYFRAMES) for noise in noises)
-    nodes = max(lengths[0] // 2, 50), lengths[-1]
+    nodes = _lengths(noises)
     runs: list[SolvedRun] = []
     rng = np.random.default_rng(0)
     while len(runs) < _LEAST_RUNS or time.monotonic() - begun < _DRAWING * 60 * minutes:

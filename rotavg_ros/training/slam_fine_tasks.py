@@ -11,12 +11,14 @@ from torch import Tensor
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily
 from rotavg_ros.solver.learning.fine_tuning import Losses, SlamFineNet, SolvedRun, losses_of, losses_under, solved_run
 from rotavg_ros.training.config import TrainingConfig
+from rotavg_ros.training.drawing import drawn
 
 # Weight of a nat per edge, for its variance's difference from the true one, relative to the mean error's logarithm. The
 # error of a single drawing says little about the quality of weights; all its edges together say much.
 NATS_WEIGHT = 0.3
 # Share of the runs that are shown as they are after one pass of FineNet, so that it learns to be applied twice.
 _SECOND_SHARE = 0.2
+_LACK = "they have too few closures, or are solved too badly; longer ones, more closures or smaller errors would help"
 
 
 class SlamFineTask:
@@ -67,13 +69,15 @@ class SlamFineTask:
 
 
 def draw_runs(family: RobotFamily, count: int, nodes: tuple[int, int], rng: np.random.Generator) -> list[SolvedRun]:
-    """``count`` runs that were solved well enough to learn from."""
-    runs: list[SolvedRun] = []
-    while len(runs) < count:
-        keyframes = round(float(np.exp(rng.uniform(*np.log(nodes)))))
-        drawn = family.drawn(keyframes, rng)
-        told = (torch.from_numpy(each) for each in (drawn.body_from_world, drawn.is_false, drawn.sigma**2))
-        run = solved_run(drawn.graph, *told)
-        if run is not None:
-            runs.append(run)
-    return runs
+    """``count`` runs that were solved well enough to learn from.
+
+    Raises:
+        DrawingError: next to none is.
+    """
+
+    def draw() -> SolvedRun | None:
+        run = family.drawn(round(float(np.exp(rng.uniform(*np.log(nodes))))), rng)
+        told = (torch.from_numpy(each) for each in (run.body_from_world, run.is_false, run.sigma**2))
+        return solved_run(run.graph, *told)
+
+    return drawn(count, draw, _LACK)

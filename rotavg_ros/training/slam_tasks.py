@@ -16,6 +16,7 @@ from rotavg_ros.metrics.calibration import expected_calibration_error
 from rotavg_ros.solver.learning.closures import ClosureFeatures, SlamCleanNet, closure_inputs
 from rotavg_ros.solver.neurora.message_passing import DirectedEdges
 from rotavg_ros.training.config import TrainingConfig
+from rotavg_ros.training.drawing import drawn
 
 # Shares of the wide family's runs that have a slip spanned by few closures (elsewhere all that span it are kept), and
 # that are of several robots.
@@ -48,8 +49,8 @@ def sample_run(
             run = several_robots(run, rng)
         graph, is_false = run.graph, run.closure_is_false
     else:
-        drawn = family.drawn(keyframes, rng)
-        graph, is_false = drawn.graph, drawn.is_false
+        of_family = family.drawn(keyframes, rng)
+        graph, is_false = of_family.graph, of_family.is_false
     inputs = closure_inputs(graph)
     if inputs is None:
         return None
@@ -112,12 +113,8 @@ class SlamCleanTask:
 
 
 def _draw(count: int, nodes: tuple[int, int], rng: np.random.Generator, family: RobotFamily | None) -> list[SlamSample]:
-    samples: list[SlamSample] = []
-    while len(samples) < count:
-        sample = sample_run(nodes, rng, family)
-        if sample is not None:
-            samples.append(sample)
-    return samples
+    lack = "they have fewer than two closures; longer ones or more closures would help"
+    return drawn(count, lambda: sample_run(nodes, rng, family), lack)
 
 
 def _loss(logit: Tensor, sample: SlamSample) -> Tensor:

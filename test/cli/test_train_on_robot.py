@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -128,6 +129,13 @@ def test_the_family_has_what_runs_show() -> None:
     assert spatial.planar_share == 0.5
     assert spatial.turns > 0.5
     assert spatial.per_turn[0] < 0.1 < spatial.per_turn[1]
+
+
+def test_simulated_runs_have_closures_to_learn_from_where_those_of_a_long_run_are_rare() -> None:
+    family = family_of([replace(NOISE, keyframes=4000, closures_per_keyframe=16 / 4000)])
+    runs = [family.drawn(400, np.random.default_rng(seed)) for seed in range(20)]  # half of the most that are simulated
+    assert min(int(run.is_closure.sum()) for run in runs) >= 12
+    assert family_of([NOISE]).closures_per_keyframe == pytest.approx((0.4 / 1.5, 0.6))
 
 
 def test_better_is_by_more_than_two_standard_errors() -> None:

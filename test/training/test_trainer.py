@@ -20,6 +20,7 @@ from rotavg_ros.solver.networks import NETWORKS
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.network_store import read_network
 from rotavg_ros.solver.neurora.paper import PaperCleanNet
+from rotavg_ros.training import drawing
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.paper_tasks import PaperCleanTask, PaperFineTask
 from rotavg_ros.training.sfm_tasks import SfmCleanTask, SfmFineTask
@@ -274,6 +275,23 @@ def test_a_stated_family_is_what_both_networks_of_robots_see() -> None:
     assert float(false.double().mean()) == pytest.approx(0.3, abs=0.05)
     runs = SlamFineTask(replace(config, graphs=2, validation_graphs=1)).runs
     assert all(run.first.told.components == 1 for run in runs)
+
+
+@pytest.mark.parametrize("task", [SlamCleanTask, SlamFineTask])
+def test_a_family_of_which_nothing_can_be_learned_is_refused(
+    task: type[SlamCleanTask | SlamFineTask], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its runs have no closures; the training had drawn others for ever."""
+    monkeypatch.setattr(drawing, "_MOST_IN_VAIN", 5)
+    config = replace(ROBOTS, robots=RobotFamily(("building",), closures_per_keyframe=(0.001, 0.001)))
+    with pytest.raises(UserError, match="of 5 simulated runs in a row none can be learned from: they have "):
+        task(config)
+
+
+def test_draws_that_give_nothing_are_left_out() -> None:
+    given = iter([None, 1, None, None, 2, 3])
+    assert drawing.drawn(2, lambda: next(given), "") == [1, 2]
+    assert next(given) == 3
 
 
 def test_the_guide_names_all_that_a_family_is_made_of() -> None:
