@@ -38,10 +38,12 @@ def run(arguments: argparse.Namespace) -> int:
         if getattr(arguments, name) is not None:
             raise OwnRobotError(f"slam takes no {name.replace('_', '-')}: it begins with the package's network")
     tried = arguments.output / _TRIED
-    with asking_about(tried, OwnRobotError):
-        is_taken = tried.exists()
-    if is_taken:  # told before the minutes that solving the runs takes
-        raise OwnRobotError(f"{tried}: is there from before; remove it or choose another --output")
+    # Told before the minutes that solving the runs takes. A network of before would be used, whatever the verdict is.
+    for path in (tried, arguments.output / f"{SlamFineNet.NAME}.safetensors"):
+        with asking_about(path, OwnRobotError):
+            is_taken = path.exists()
+        if is_taken:
+            raise OwnRobotError(f"{path}: is there from before; remove it or choose another --output")
     runs = [_read(path, truth) for path, truth in zip(arguments.runs, truths, strict=True)]
     noises = [each.noise() for each in runs]
     for path, noise in zip(arguments.runs, noises, strict=True):

@@ -107,15 +107,17 @@ def test_what_does_not_fit_is_refused(
     assert re.search(message, capsys.readouterr().err)
 
 
+@pytest.mark.parametrize("name", ["tried", "slam-fine-net.safetensors"])
 def test_an_output_that_is_taken_is_told_of_before_the_runs_are_solved(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    tried = tmp_path / "robot" / "tried"
-    tried.mkdir(parents=True)
-    command = ["train", "slam", "--from", str(tmp_path / "nowhere.g2o"), "--output", str(tried.parent)]
+    """Also by a network of before, which would be used though the verdict is that the package's is better."""
+    there = tmp_path / "robot" / name
+    there.mkdir(parents=True)
+    command = ["train", "slam", "--from", str(tmp_path / "nowhere.g2o"), "--output", str(there.parent)]
     assert main(command) == 2
     said = capsys.readouterr().err
-    assert said == f"rotavg: error: {tried}: is there from before; remove it or choose another --output\n"
+    assert said == f"rotavg: error: {there}: is there from before; remove it or choose another --output\n"
 
 
 def test_the_family_has_what_runs_show() -> None:
