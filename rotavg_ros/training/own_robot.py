@@ -18,7 +18,7 @@ from rotavg_ros.solver.learning.robot_runs import RobotNoise, RobotRun
 from rotavg_ros.solver.networks import load_network, read_network
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.slam_fine_tasks import SlamFineTask, draw_runs
-from rotavg_ros.training.trainer import Trainer
+from rotavg_ros.training.trainer import Trainer, fingerprint
 
 # Uncertainty of what is measured on few runs: a factor, and a difference for shares.
 _FACTOR, _SHARE = 1.5, 0.1
@@ -127,13 +127,15 @@ def fine_tune(
     while len(runs) < _LEAST_RUNS or time.monotonic() - begun < _DRAWING * 60 * minutes:
         runs += draw_runs(family, 1, nodes, rng)
     told(f"{len(runs)} simulated runs of {nodes[0]}–{nodes[1]} keyframes")
+    training, validation = [run for number, run in enumerate(runs) if number % _EVERY], runs[::_EVERY]
     config = TrainingConfig(
-        family="slam", recipe="robots", nodes=nodes, graphs=len(runs), validation_nodes=nodes, batch_graphs=8,
-        learning_rate=5e-4, weight_decay=0.0, edge_dropout=0.0, passes=2, robots=family,
+        family="slam", recipe="robots", nodes=nodes, graphs=len(training), validation_nodes=nodes,
+        validation_graphs=len(validation), batch_graphs=8, learning_rate=5e-4, weight_decay=0.0, edge_dropout=0.0,
+        passes=2, robots=family,
     )  # fmt: skip
-    task = SlamFineTask.on(config, [run for number, run in enumerate(runs) if number % _EVERY], runs[::_EVERY])
-    start = load_network(SlamFineNet).state_dict()
-    task.network.load_state_dict(start)
+    task = SlamFineTask.on(config, training, validation)
+    start = load_network(SlamFineNet)
+    task.network.load_state_dict(start.state_dict())
     clocked = time.monotonic()
     for terms in task.batches(np.random.default_rng(0)):
         terms["loss"].backward()  # type: ignore[no-untyped-call]
@@ -144,7 +146,8 @@ def fine_tune(
     config = replace(config, epochs=int(np.clip(left / an_epoch, 2, _MOST_EPOCHS)))
     task.config = config
     told(f"{config.epochs} epochs of {an_epoch:.0f} s")
-    trainer = Trainer(task, config, folder, SlamFineNet.NAME, command="rotavg train slam --from …")
+    inputs = {"start_fingerprint": fingerprint(start)}
+    trainer = Trainer(task, config, folder, SlamFineNet.NAME, inputs, "rotavg train slam --from …")
     trainer.run()
     return read_network(SlamFineNet, trainer.weights_path)
 

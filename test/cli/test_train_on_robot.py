@@ -16,10 +16,13 @@ from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.simulation.stress.drawn import DrawnGraph
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily
+from rotavg_ros.solver.learning.fine_tuning import SlamFineNet
 from rotavg_ros.solver.learning.robot_runs import RobotNoise
+from rotavg_ros.solver.networks import load_network
 from rotavg_ros.training import own_robot
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.own_robot import Verdict, family_of
+from rotavg_ros.training.trainer import fingerprint
 
 NOISE = RobotNoise(
     keyframes=400,
@@ -70,6 +73,10 @@ def test_a_network_is_kept_only_if_it_is_better(
     assert main(command) == 0
     told = capsys.readouterr().out
     assert "run.g2o: planar; odometry " in told and "stretches held back" in told
+    simulated = re.search(r"(\d+) simulated runs", told)
+    card = json.loads(Path("robot/tried/slam-fine-net.json").read_text())
+    assert simulated and card["config"]["graphs"] + card["config"]["validation_graphs"] == int(simulated[1])
+    assert card["start_fingerprint"] == fingerprint(load_network(SlamFineNet))
     assert Path("robot/slam-fine-net.safetensors").exists() == is_better
     verdict = json.loads(Path("robot/verdict.json").read_text())
     assert verdict["kept"] == is_better and verdict["stretches"] > 1
