@@ -10,9 +10,12 @@ import pytest
 import torch
 
 from rotavg_ros import rotations
+from rotavg_ros.cli import evaluate_slam
 from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
+from rotavg_ros.datasets.simulation.stress.kinds import REPORTING_SEEDS, TUNING_SEEDS
+from rotavg_ros.evaluation.slam import pose_cases
 
 
 @pytest.fixture
@@ -47,6 +50,11 @@ def test_report(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for file in (data / "results").glob("*.png"):
         assert f"({file.name})" in text
     assert "GNC" not in text.split("## CPU seconds")[0]
+
+
+def test_no_suite_reports_on_seeds_for_tuning() -> None:
+    for seeds in (evaluate_slam._RECORDED_SEEDS, REPORTING_SEEDS, pose_cases.REPORTING_SEEDS):
+        assert not {*seeds} & {*TUNING_SEEDS}
 
 
 def test_stress(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

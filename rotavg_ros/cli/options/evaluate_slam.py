@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=whole_number,
         metavar="S",
-        help="of the drawings (default: recorded 0 1 2; stress 1000 to 1019, poses 1000 to 1002; the solver is "
+        help="of the drawings (default: recorded 100 101 102; stress 1000 to 1019, poses 1000 to 1002; the solver is "
         "tuned on 0 to 19)",
     )
     parser.add_argument(
