@@ -22,7 +22,7 @@ from rotavg_ros.view_graph import ViewGraph
 
 # None: the case is too large for it, or it gives up.
 Contender = Callable[[Case], Answer | None]
-Reference = Callable[[Case], Tensor]
+Reference = Callable[[Case], Tensor | None]
 
 
 class ContenderError(UserError):
@@ -49,7 +49,7 @@ class Roster:
     Attributes:
         family: of the suite's cases.
         peers: of :data:`rotavg_ros.evaluation.common.named_peers.PEERS`.
-        references: case → body_from_world ``(N, 4)``, by name.
+        references: case → body_from_world ``(N, 4)``, None if the case does not tell what it has to know; by name.
         max_edges: number of edges of the largest graph that a contender is given, by name.
         own: contenders only of this suite, by name.
     """
@@ -105,7 +105,7 @@ def _contender(name: str, roster: Roster, weights: Path | None, keep: KeptAnswer
         return partial(_run_peer, peer_solver(name, keep), roster.max_edges.get(name))
     if name in roster.references:
         reference = roster.references[name]
-        run = partial(_run_reference, reference)
+        run: Contender = partial(_run_reference, reference)
         return run if keep is None else keep.keeping(run, name, (__name__, reference.__module__))
     if name in roster.own:
         return _own(name, roster, keep)
@@ -149,10 +149,12 @@ def _run_method(name: str, weights: Path | None, case: Case) -> Answer:
     )
 
 
-def _run_reference(reference: Reference, case: Case) -> Answer:
+def _run_reference(reference: Reference, case: Case) -> Answer | None:
     clock = Clock()
     with clock.running():
         orientations = reference(case)
+    if orientations is None:
+        return None
     return _judged(Answer(orientations, clock.seconds, clock.cpu_seconds), case)
 
 

@@ -18,18 +18,20 @@ from rotavg_ros.view_graph import EdgeLabel
 FULL_PIPELINE = "neurora"
 
 
-def oracle(case: Case) -> Tensor:
-    """Chatterjee & Govindu's ℓ1 → ℓ½ on the true inliers, from the truth."""
+def oracle(case: Case) -> Tensor | None:
+    """Chatterjee & Govindu's ℓ1 → ℓ½ on the true inliers, from the truth; None: unknown."""
     return _told(case, "chatterjee")
 
 
-def shaped_oracle(case: Case) -> Tensor:
-    """Our refinement on the true inliers, from the truth; the noise's shape is estimated from the residuals."""
+def shaped_oracle(case: Case) -> Tensor | None:
+    """The same with our refinement; the noise's shape is estimated from the residuals."""
     return _told(case, "neurora-without-both")
 
 
-def _told(case: Case, method: str) -> Tensor:
+def _told(case: Case, method: str) -> Tensor | None:
     """A method that is told which edges are outliers, and begins at the truth."""
+    if not bool(case.truth.isfinite().all()):
+        return None
     label = torch.where(case.is_inlier, EdgeLabel.AUTOMATIC, EdgeLabel.REJECTED).to(case.graph.label)
     graph = replace(case.graph, label=label)
     return solve(graph, method=method, profile="sfm", device="cpu", warm_start=case.truth).body_from_world

@@ -11,7 +11,7 @@ import torch
 
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.errors import UserError
-from rotavg_ros.evaluation.common.cases import drawings
+from rotavg_ros.evaluation.common.cases import CaseKey, drawings
 from rotavg_ros.evaluation.common.contenders import contenders
 from rotavg_ros.evaluation.sfm import real, rgbd, small_training, synthetic
 from rotavg_ros.evaluation.sfm.contenders import ROSTER
@@ -32,6 +32,16 @@ def test_graphs_are_the_same_whatever_their_number(monkeypatch: pytest.MonkeyPat
 
 def test_rows_can_all_run() -> None:
     contenders([name for name in synthetic.ROWS if name not in ROSTER.peers], ROSTER)
+
+
+def test_oracles_give_up_where_the_truth_is_unknown() -> None:
+    """As on Madrid, beside which all other answers had been lost."""
+    sample = PaperRecipe(cameras=(12, 16), pair_share=(0.5, 0.5)).sample(np.random.default_rng(0))
+    known = synthetic.case_of(CaseKey("known"), sample)
+    unknown = replace(known, truth=torch.full_like(known.truth, torch.nan), noise_covariance=None)
+    for oracle in contenders(("oracle", "oracle-shaped", "oracle-covariances"), ROSTER).values():
+        assert oracle(known) is not None
+        assert oracle(unknown) is None
 
 
 @pytest.mark.large
