@@ -53,12 +53,10 @@ def reliability(path: Path, calibration: dict[str, CalibrationBins], title: str)
     figure = Figure(figsize=(7, 7), dpi=150, facecolor="white", layout="constrained")
     upper, lower = figure.subplots(2, 1, height_ratios=(3, 1), sharex=True)
     upper.plot([0, 1], [0, 1], color=MUTED, linewidth=1, linestyle=_DASHED)
-    for colour, (label, bins) in zip(PALETTE, calibration.items(), strict=False):
-        rows = bins.rows
-        upper.plot(
-            rows[:, 1], rows[:, 2], "o-", color=colour, linewidth=1.4, markersize=4, label=f"{label}: {bins.error:.3f}"
-        )
-        lower.plot(rows[:, 1], rows[:, 0] / rows[:, 0].sum(), "o-", color=colour, linewidth=1.2, markersize=3)
+    for number, (label, bins) in enumerate(calibration.items()):
+        rows, line = bins.rows, {**line_of(number), "marker": "o"}
+        upper.plot(rows[:, 1], rows[:, 2], **line, linewidth=1.4, markersize=4, label=f"{label}: {bins.error:.3f}")
+        lower.plot(rows[:, 1], rows[:, 0] / rows[:, 0].sum(), **line, linewidth=1.2, markersize=3)
     upper.legend(title="expected calibration error", frameon=False, fontsize=9, title_fontsize=9, labelcolor=INK)
     lower.set_yscale("log")
     lower.set_xlim(-0.02, 1.02)
@@ -68,6 +66,11 @@ def reliability(path: Path, calibration: dict[str, CalibrationBins], title: str)
     lower.set_ylabel("share of edges", fontsize=9, color=MUTED)
     lower.set_xlabel("stated probability of being an outlier", fontsize=9, color=MUTED)
     figure.savefig(path)
+
+
+def line_of(number: int) -> dict[str, str]:
+    """Colour and style of a picture's lines, counted from 0; they differ up to twice as many as there are colours."""
+    return {"color": PALETTE[number % len(PALETTE)], "linestyle": "-" if number < len(PALETTE) else "--"}
 
 
 def style(axes: Axes, title: str) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.evaluation.common.plots import MUTED, PALETTE, style
+from rotavg_ros.evaluation.common.plots import MUTED, PALETTE, line_of, style
 
 
 class TrainingLogError(UserError):
@@ -69,10 +69,10 @@ def draw_together(path: Path, runs_of: Mapping[str, Mapping[str, tuple[np.ndarra
     figure = Figure(figsize=(4.6 * len(runs_of), 3.6), dpi=110, facecolor="white", layout="constrained")
     panels = figure.subplots(1, len(runs_of), squeeze=False)[0]
     for axes, (title, runs) in zip(panels, runs_of.items(), strict=True):
-        for colour, (label, (epochs, objective)) in zip(PALETTE, runs.items(), strict=False):
+        for number, (label, (epochs, objective)) in enumerate(runs.items()):
             best, share = int(objective.argmin()), epochs / epochs[-1]
-            axes.plot(share, objective, color=colour, linewidth=1.0, label=label)
-            axes.plot(share[best], objective[best], "o", color=colour, markersize=4)
+            (line,) = axes.plot(share, objective, **line_of(number), linewidth=1.0, label=label)
+            axes.plot(share[best], objective[best], "o", color=line.get_color(), markersize=4)
         axes.set_yscale("log")
         style(axes, title)
         axes.set_xlabel("share of the epochs", fontsize=9, color=MUTED)
