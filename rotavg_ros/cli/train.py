@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -130,6 +130,8 @@ def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Pa
         raise TrainCommandError("--clean-net is for SfM's fine-net; robots' graphs are solved with the package's")
     if config.family == "slam" and device == "cuda":
         raise TrainCommandError("the SLAM profile's networks train on the CPU, where its graphs live")
+    if config.family == "slam" and network == "fine-net":
+        config = replace(config, edge_dropout=0.0)  # its runs are solved as they are; the card is to say so
     name = f"{config.family}-{network}"
     # Errors in any of the files are noticed before the minutes that drawing graphs takes.
     weights = None if given.start is None else read_network(NETWORKS[name], given.start)

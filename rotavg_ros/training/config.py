@@ -41,7 +41,7 @@ class TrainingConfig:
         warmup_epochs: number of epochs at the start over which the rate grows.
         averaging: the weights that are validated and kept are an exponential mean over the steps; this is the weight
             of each step relative to the next; 0 for the last step's own weights.
-        edge_dropout: share of each graph's edges left out anew in every epoch.
+        edge_dropout: share of each graph's edges left out anew in every epoch; FineNet of robots' graphs has none.
         passes: FineNet: largest number of passes in a row, as in NeuRoRA-v2; it learns from the last pass, and fewer
             passes are more likely.
         seed: of data, initial weights and order.

@@ -63,6 +63,18 @@ def test_clean_net_by_path(config: Path, tmp_path: Path) -> None:
     assert all(torch.equal(first[key], second[key]) for key in first)
 
 
+def test_the_card_of_robots_fine_net_states_no_dropout(tmp_path: Path) -> None:
+    """It has none, whatever the default is."""
+    config = tmp_path / "robots.yaml"
+    config.write_text(
+        "family: slam\nrecipe: robots\nnodes: [60, 80]\ngraphs: 1\nvalidation_nodes: [60, 80]\nvalidation_graphs: 1\n"
+        "epochs: 1\nrobots:\n  worlds: [building]\n"
+    )
+    assert main(["train", "slam-fine-net", str(config), *CPU, "--output", str(tmp_path)]) == 0
+    for card in (tmp_path / "slam-fine-net.json", WEIGHTS_FOLDER / "slam-fine-net.json"):
+        assert json.loads(card.read_text())["config"]["edge_dropout"] == 0
+
+
 def test_training_goes_on_from_given_weights(config: Path, tmp_path: Path) -> None:
     start = WEIGHTS_FOLDER / "sfm-clean-net.safetensors"
     still = tmp_path / "still.yaml"
