@@ -29,6 +29,8 @@ _SOLVES = 4
 # False closures repeat each other's turn if they agree within this, rad.
 _SAME_TURN = np.radians(5.0)
 _LEAST_SHARE = 0.02
+# Least part of a step's variance that is not due to turns. Where they explain nearly all, least squares may leave none.
+_LEAST_APART = 0.1
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class RobotNoise:
     Attributes:
         keyframes: number of keyframes.
         planar: whether all rotations are about one axis.
-        odometry_deg: typical error of a step.
+        odometry_deg: typical error of a step, without what it errs more by because it turns.
         closure_deg: typical error of a good closure.
         closures_per_keyframe: number of closures per keyframe.
         false_share: share of the closures that are false.
@@ -82,19 +84,24 @@ def robot_noise(mode: Mode, network: SlamFineNet, truth: np.ndarray | None = Non
     odometry, k, noise = evidence.is_odometry, evidence.components, state.noise
     usual = [evidence.own[kind] * _level(evidence, kind) for kind in (odometry, ~odometry)]
     steps = np.maximum(evidence.steps[odometry], 1.0)
+    of_step = k * float(np.median(usual[0] / steps))
+    per_turn = 0.0
+    if noise.turn_share > 0:
+        apart, per_turn = _by_turns(mode, evidence)
+        of_step = float(np.clip(apart, _LEAST_APART * of_step, of_step)) if per_turn > 0 else of_step
     is_false = ~evidence.is_good[~odometry]
     closures = max(len(is_false), 1)
     return RobotNoise(
         keyframes=len(problem.graph.above),
         planar=k == 1,
-        odometry_deg=float(np.degrees(np.sqrt(k * np.median(usual[0] / steps)))),
+        odometry_deg=float(np.degrees(np.sqrt(of_step))),
         closure_deg=float(np.degrees(np.sqrt(k * np.median(usual[1])))) if len(usual[1]) else 0.0,
         closures_per_keyframe=len(is_false) / len(problem.graph.above),
         false_share=float(is_false.sum()) / closures,
         grouped_share=_grouped(mode),
         step_spread=_spread_along(mode, network),
         closure_spread=_spread(evidence, ~odometry),
-        per_turn=_per_turn(mode, evidence) if noise.turn_share > 0 else 0.0,
+        per_turn=per_turn,
         common_share=noise.common_share if noise.run_steps > 0 else 0.0,
         states_precision=noise.exponent > 0,
     )
@@ -180,13 +187,16 @@ def _spread_along(mode: Mode, network: SlamFineNet) -> float:
     return float(np.sqrt(np.average((level - middle) ** 2, weights=steps)))
 
 
-def _per_turn(mode: Mode, evidence: Evidence) -> float:
-    """Error over angle, by non-negative least squares of squared errors on steps and squared turns."""
+def _by_turns(mode: Mode, evidence: Evidence) -> tuple[float, float]:
+    """Squared error of a step that does not turn, rad², and error over angle of what turns add; 0 and 0 if unknown.
+
+    By non-negative least squares of squared errors on steps and squared turns.
+    """
     problem = mode.problem
     segments = np.flatnonzero(evidence.is_odometry & evidence.is_good & (evidence.own > evidence.predicted))
     segments = segments[segments < problem.graph.num_segments]
     if problem.turned is None or len(segments) < _LEAST_EDGES:
-        return 0.0
+        return 0.0, 0.0
     graph = problem.graph
     turned = problem.turned[graph.nodes]
     square = np.maximum(turned[graph.target[segments]] - turned[graph.source[segments]], 0.0)
@@ -195,7 +205,8 @@ def _per_turn(mode: Mode, evidence: Evidence) -> float:
     left = (evidence.square[segments] - evidence.components * evidence.predicted[segments]) / unit
     causes = np.stack((graph.own_steps[segments], square), axis=1) / unit[:, None]
     scale = causes.mean(axis=0) + 1e-300
-    return float(np.sqrt(nnls(causes / scale, left)[0][1] / scale[1]))
+    apart, added = nnls(causes / scale, left)[0] / scale
+    return float(apart), float(np.sqrt(added))
 
 
 def _grouped(mode: Mode) -> float:

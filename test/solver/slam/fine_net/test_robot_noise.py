@@ -66,6 +66,15 @@ def test_errors_in_turns_show_by_the_truth() -> None:
     assert run_of(USUAL, 1, True)[1].noise().per_turn < 0.03
 
 
+def test_what_turns_add_is_not_counted_again_as_a_steps_own_error() -> None:
+    """Runs are simulated with both, so that they erred three times as much as the robot's."""
+    turning = replace(USUAL, turns=1, per_turn=(0.1, 0.1), odometry_deg=(0.3, 0.3))
+    for knows_truth in (False, True):
+        found = [run_of(turning, seed, knows_truth)[1].noise().odometry_deg for seed in (1, 2, 3)]
+        assert 0.3 / 2 < np.median(found) < 0.3 * 2, found
+        assert max(found) < 0.3 * 2.5, found
+
+
 def test_false_closures_that_agree_show() -> None:
     grouped = replace(USUAL, grouped_share=1.0)
     assert run_of(grouped, 4)[1].noise().grouped_share > 0.8
