@@ -37,6 +37,8 @@ def run(arguments: argparse.Namespace) -> int:
     for name in ("config", "clean_net", "start"):
         if getattr(arguments, name) is not None:
             raise OwnRobotError(f"slam takes no {name.replace('_', '-')}: it begins with the package's network")
+    if arguments.device == "cuda":
+        raise OwnRobotError("robots' networks train on the CPU, where their graphs live; leave out --device cuda")
     tried = arguments.output / _TRIED
     # Told before the minutes that solving the runs takes. A network of before would be used, whatever the verdict is.
     for path in (tried, arguments.output / f"{SlamFineNet.NAME}.safetensors"):

@@ -94,6 +94,7 @@ def test_a_network_is_kept_only_if_it_is_better(
         (["slam"], "slam fine-tunes on your runs and needs --from"),
         (["slam-fine-net", "--from", "run.g2o"], "other networks take none"),
         (["slam", "my.yaml", "--from", "run.g2o"], "slam takes no config"),
+        (["slam", "--from", "run.g2o", "--device", "cuda"], "train on the CPU"),
         (["slam", "--from", "run.g2o", "--truth", "a.csv", "b.csv"], "--truth names 2 files, --from 1"),
         (["slam", "--from", "few.g2o"], "few.g2o: has .* closures?; need odometry and 12 closures at least"),
         (["slam-clean-net", "sfm-clean-net"], "is of the family sfm, slam-clean-net of the family slam"),
