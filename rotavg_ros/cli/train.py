@@ -22,6 +22,8 @@ from rotavg_ros.training.slam_fine_tasks import SlamFineTask
 from rotavg_ros.training.slam_tasks import SlamCleanTask
 from rotavg_ros.training.trainer import Trainer, TrainingTask, fingerprint
 
+# Largest numbers of FineNet's passes in a row, where the task has one.
+_MOST_PASSES = {"slam": 2, "paper": 1}
 _CONFIGS = Path(__file__).parent.parent / "training" / "configs"
 
 
@@ -130,6 +132,10 @@ def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Pa
         raise TrainCommandError("--clean-net is for SfM's fine-net; robots' graphs are solved with the package's")
     if config.family == "slam" and device == "cuda":
         raise TrainCommandError("the SLAM profile's networks train on the CPU, where its graphs live")
+    most = _MOST_PASSES.get(config.family, config.passes)
+    if network == "fine-net" and config.passes > most:
+        what = f"FineNet of the family {config.family} learns from {most} in a row at most"
+        raise TrainCommandError(f"{given.config}: passes is {config.passes}; {what}")
     if config.family == "slam" and network == "fine-net":
         config = replace(config, edge_dropout=0.0)  # its runs are solved as they are; the card is to say so
     name = f"{config.family}-{network}"

@@ -43,7 +43,7 @@ class TrainingConfig:
             of each step relative to the next; 0 for the last step's own weights.
         edge_dropout: share of each graph's edges left out anew in every epoch; FineNet of robots' graphs has none.
         passes: FineNet: largest number of passes in a row, as in NeuRoRA-v2; it learns from the last pass, and fewer
-            passes are more likely.
+            passes are more likely; at most 2 in the family slam, 1 in the family paper.
         seed: of data, initial weights and order.
         goes_on_from: the configuration whose weights this one starts from (``rotavg train --start``); empty: none.
         robots: for the recipe "robots": worlds, noise, false closures and how uneven they are; None: the defaults.

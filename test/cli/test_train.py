@@ -75,6 +75,19 @@ def test_the_card_of_robots_fine_net_states_no_dropout(tmp_path: Path) -> None:
         assert json.loads(card.read_text())["config"]["edge_dropout"] == 0
 
 
+@pytest.mark.parametrize(
+    ("network", "lines", "most"),
+    [("slam-fine-net", "family: slam\nrecipe: robots\npasses: 3\n", 2), ("fine-net", "family: paper\npasses: 2\n", 1)],
+)
+def test_more_passes_than_a_network_learns_from_are_refused(
+    network: str, lines: str, most: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "many.yaml"
+    config.write_text(lines)
+    assert main(["train", network, str(config), *CPU, "--output", str(tmp_path / "out")]) == 2
+    assert f"learns from {most} in a row at most" in capsys.readouterr().err
+
+
 def test_training_goes_on_from_given_weights(config: Path, tmp_path: Path) -> None:
     start = WEIGHTS_FOLDER / "sfm-clean-net.safetensors"
     still = tmp_path / "still.yaml"
