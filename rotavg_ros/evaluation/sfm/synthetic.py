@@ -160,6 +160,8 @@ def report(folder: Path, results: Results, command: str) -> Path:
             )
         tables[f"synthetic-{recipe}-outliers"] = classification(f"Outliers on {title}", of_recipe, classifiers)
         per_graph[f"synthetic-{recipe}-graphs"] = per_case(f"Every graph of {title}", of_recipe, PER_GRAPH)
+        if not of_recipe.rows:  # interrupted before the first graph was done
+            continue
         labels = {name: ROWS.get(name, name).replace("**", "") for name in results.names}
         picture = f"synthetic-{recipe}.png"
         plots.errors(folder / picture, of_recipe, labels, f"Error, recipe {recipe}", reference=FULL_PIPELINE)

@@ -13,8 +13,10 @@ from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.cases import CaseKey, drawings
 from rotavg_ros.evaluation.common.contenders import contenders
+from rotavg_ros.evaluation.common.scoring import Scores
 from rotavg_ros.evaluation.sfm import real, rgbd, small_training, synthetic
 from rotavg_ros.evaluation.sfm.contenders import ROSTER
+from rotavg_ros.metrics import CalibrationBins
 from rotavg_ros.solver.networks import NETWORKS
 from rotavg_ros.solver.neurora.network_store import read_network
 from rotavg_ros.training.sfm_tasks import GivenGraphs
@@ -32,6 +34,15 @@ def test_graphs_are_the_same_whatever_their_number(monkeypatch: pytest.MonkeyPat
 
 def test_rows_can_all_run() -> None:
     contenders([name for name in synthetic.ROWS if name not in ROSTER.peers], ROSTER)
+
+
+def test_a_run_that_is_interrupted_before_its_first_graph_has_a_page_without_pictures(tmp_path: Path) -> None:
+    nothing = Scores(calibration={name: CalibrationBins() for name in synthetic.CORE}, interrupted=True)
+    page = synthetic.report(
+        tmp_path, synthetic.Results(synthetic.CORE, {"paper": nothing}), "rotavg evaluate synthetic"
+    )
+    assert "0 graphs." in page.read_text(encoding="utf-8")
+    assert not [*tmp_path.glob("*.png")]
 
 
 def test_oracles_give_up_where_the_truth_is_unknown() -> None:
