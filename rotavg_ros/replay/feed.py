@@ -134,15 +134,19 @@ def _time_lines(records: list[OdometryRecord], options: EstimatorOptions) -> NDA
         return time_line
     jumps, taken_ns = BackwardJumps(), GrowingArray(np.int64)
     rule = options.time_jump_ns, options.on_time_jump
+    late: list[tuple[int, OdometryMessage]] = []
     for row, record in enumerate(records):
         stamps_ns = [record.stamp_ns]
         if len(taken_ns) and record.stamp_ns <= taken_ns.view[-1]:
             message = OdometryMessage("reference", record.stamp_ns, record.world_from_body, record.position)
-            stamps_ns = [late.stamp_ns for late in jumps.late(message, taken_ns.view, *rule)]
-            if not stamps_ns:
+            late.append((row, message))
+            since_jump = jumps.late(message, taken_ns.view, *rule)
+            if not since_jump:
                 continue
-            time_line[row + 1 - len(stamps_ns) :] += 1
+            stamps_ns = [each.stamp_ns for each in since_jump]
+            time_line[next(first for first, each in late if each is since_jump[0]) :] += 1
         jumps.on_time("reference")
+        late.clear()
         taken_ns.extend(np.array(stamps_ns))
     return time_line
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.files.pose_files import read_pose_file
 from rotavg_ros.replay.feed import read_references
 from rotavg_ros.replay.plan import Input, Wishes, make_plan
+from rotavg_ros.settings.parameters import NodeParameters
 
 from .bag_forms import StoragePlugin, Writer
 from .conftest import SELDOM
@@ -76,6 +79,20 @@ def test_a_reference_has_both_turns_wherever_edges_are_placed(looped: Path, gap:
     assert reference.time_line is not None
     first, second = (reference.stamp_ns[reference.time_line == turn].tolist() for turn in range(2))
     assert first == second and len(reference.stamp_ns) == 2 * len(first)
+
+
+def test_a_reference_has_both_turns_though_its_stamps_repeat() -> None:
+    """As those of a simulation whose clock is coarser than its messages."""
+    stamps = [SimpleNamespace(sec=stamp, nanosec=0) for _ in range(2) for stamp in range(100, 130) for _ in range(2)]
+    origin, upright = SimpleNamespace(x=0.0, y=0.0, z=0.0), SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+    pose = SimpleNamespace(position=origin, orientation=upright)
+    messages = [SimpleNamespace(header=SimpleNamespace(stamp=stamp, frame_id="map"), pose=pose) for stamp in stamps]
+    bag: Any = SimpleNamespace(decoded=lambda *_: [("/truth", 0, message) for message in messages])
+    inputs = {"robot": Input("/truth", "geometry_msgs/msg/PoseStamped")}
+    (reference,) = read_references(bag, inputs, NodeParameters(), 0, 1).values()
+    assert reference.time_line is not None
+    turns = [(reference.stamp_ns[reference.time_line == turn] // 10**9).tolist() for turn in range(2)]
+    assert turns == [list(range(100, 130))] * 2
 
 
 def test_a_trajectory_has_every_stamp_once(once: Path, twice: Path) -> None:

@@ -51,6 +51,8 @@ class BackwardJumps:
             the messages since the jump, in order; empty as long as it is not certain, or if it has been told.
         """
         run = self._runs.setdefault(message.robot, [])
+        if run and run[0].stamp_ns <= message.stamp_ns <= run[-1].stamp_ns:
+            return []  # late by the new time as well: stamps of a coarse clock come twice
         if run and not 0 < message.stamp_ns - run[-1].stamp_ns <= _longest_step_ns(taken_ns[-RECENT:]):
             run.clear()
         is_told = policy in KEEPS_TIME_LINE and message.robot in self._told

@@ -63,6 +63,21 @@ def test_a_bag_that_begins_again_is_seen_whatever_its_rate(steps: list[float], m
     assert online.time_jumps == 1 and online.counts().rejected == {}
 
 
+@pytest.mark.parametrize("order", [[0, 0, 1, 1, 2, 2, 3, 3], [0, 2, 1, 3, 5, 4, 6, 7]], ids=["twice", "swapped"])
+def test_a_bag_that_begins_again_is_seen_though_stamps_repeat_or_are_out_of_order(order: list[int]) -> None:
+    """A simulation whose odometry is faster than its ``/clock``; a network that overtakes itself."""
+    online = estimator("new_component")
+    indices = [block + index for block in range(0, 80, 8) for index in order]
+    for _ in range(2):
+        for index in indices:
+            feed(online, range(index, index + 1))
+    snapshot = online.snapshot()
+    assert online.time_jumps == 1 and snapshot.time_line.max() == 1
+    assert (np.diff(snapshot.stamp_ns) > 0).sum() == len(snapshot.stamp_ns) - 2, "the two turns, each in order"
+    stamps = [snapshot.stamp_ns[snapshot.time_line == line].tolist() for line in range(2)]
+    assert stamps[0] == stamps[1]
+
+
 def turn(source: int, target: int) -> list[float]:
     between = Rotation.from_quat(rotation(target)).inv() * Rotation.from_quat(rotation(source))
     return between.as_quat().tolist()
