@@ -21,6 +21,8 @@ _STALE_PERIODS = 10
 _FIRST_ANSWER_S = 300.0
 # Ticks longer ago than this say nothing about the present load.
 _RECENT_S = 60.0
+# Odometry that has waited longer than this, in the median of the last second, makes all that follows from it late.
+_LONG_WAIT_S = 1.0
 # Robots' names come from messages and may be anything; only this many are shown.
 _MOST_NAMES = 3
 # What happens when time goes back, by the policy.
@@ -145,6 +147,9 @@ def _warnings(health: Health, parameters: NodeParameters, now: float) -> list[st
                 warnings.append(
                     f"no odometry yet on {topic}" if last is None else f"no odometry for {silent:.0f} s on {topic}"
                 )
+    waited_s = 1e-3 * health.odometry_wait.median_ms(window_s=1.0)
+    if waited_s > _LONG_WAIT_S:
+        warnings.append(f"odometry waits {waited_s:.1f} s in its queue: it comes faster than it is taken")
     median = health.ticks.median_ms(_RECENT_S)
     if median > 1e3 * parameters.solve_period_s:
         warnings.append(f"a solve takes longer ({median:.0f} ms) than solve_period_s")

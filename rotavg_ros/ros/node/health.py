@@ -21,6 +21,7 @@ class Health:
         odometry, edges: message counters by topic name.
         ticks, odometry_callback: durations of ticks and of the odometry callback.
         odometry_latency: time from the sending of odometry to the publishing of ``orientation``.
+        odometry_wait: how long odometry has waited in the middleware's queue before it was taken.
         started: when the node started.
         last_odometry: when a message was last taken, by topic name.
         last_refusal: when odometry was last refused, and why, by topic name.
@@ -43,6 +44,7 @@ class Health:
     ticks: Durations = field(default_factory=Durations)
     odometry_callback: Durations = field(default_factory=Durations)
     odometry_latency: Durations = field(default_factory=Durations)
+    odometry_wait: Durations = field(default_factory=Durations)
     started: float = field(default_factory=time.monotonic)
     last_odometry: dict[str, float] = field(default_factory=dict)
     last_refusal: dict[str, tuple[float, str]] = field(default_factory=dict)

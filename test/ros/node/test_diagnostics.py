@@ -169,6 +169,17 @@ def test_slow_solves_losses_and_refusals_warn(health: Health) -> None:
     assert "2 messages lost" in report(health).message
 
 
+def test_odometry_that_queues_makes_the_present_pose_late(health: Health) -> None:
+    """At 1 kHz the pose came seconds late, and all was said to be well."""
+    for seconds in (0.01, 0.02, 5.0):  # one pause is none
+        health.odometry_wait.add(seconds)
+    assert report(health).level == OK
+    for _ in range(4):
+        health.odometry_wait.add(3.0)
+    status = report(health)
+    assert status.level == WARN and "odometry waits 3.0 s in its queue" in status.message
+
+
 def test_a_front_end_that_has_begun_anew_is_told_of_for_a_minute(health: Health) -> None:
     """Each of its refusals passes in a second, and what to do is not in their counts."""
     reporter = Reporter("rotavg: estimator")

@@ -145,6 +145,8 @@ class Subscriptions:
         message: Any,
         info: dict[str, Any] | None,
     ) -> None:
+        if info is not None and (received_ns := info.get("received_timestamp")):  # 0: the middleware does not say
+            self._health.odometry_wait.add(1e-9 * (time.time_ns() - received_ns))
         started = time.perf_counter()
         time_jumps = self._estimator.time_jumps
         try:
