@@ -68,18 +68,24 @@ def check_time(path: str | Path, odometry: list[Pose]) -> None:
         BagReadError: time goes back.
     """
     options, time, known = EstimatorOptions(), DataTime(), set[tuple[float, ...]]()
-    in_a_row = 0
+    run: dict[tuple[float, ...], int] = {}  # messages that are back, one after the other, and their rows
     for row, (stamp_ns, position, rotation) in enumerate(odometry):
         message = (stamp_ns, *position, *rotation)
         now_ns = time.advance(stamp_ns, options.continuity_limits.lead_ns)
         if now_ns is not None:
             time.claimed_ns = None  # only the next message may confirm a stamp far ahead
         back_ns = 0 if now_ns is None else now_ns - stamp_ns
-        in_a_row = in_a_row + 1 if back_ns > options.time_jump_ns and message not in known else 0
+        if message in run:
+            continue  # it comes twice
+        if back_ns <= options.time_jump_ns or message in known:
+            run.clear()
+        else:
+            run[message] = row
         known.add(message)
-        if in_a_row == RUN_LENGTH:
+        if len(run) == RUN_LENGTH:
+            first = next(iter(run.values()))
             raise BagReadError(
-                f"{path}: {ODOM_TOPIC}: time goes back by {back_ns / NANOSECONDS:.1f} s after {row + 1 - RUN_LENGTH} "
+                f"{path}: {ODOM_TOPIC}: time goes back by {back_ns / NANOSECONDS:.1f} s after {first} "
                 "messages, and a graph has room for one time; `rotavg replay` reads the bag, with a component for each"
             )
 
