@@ -95,6 +95,8 @@ class CurrentContent:
 
     def clock_went_back(self, now_ns: int, from_ns: int | None) -> None:
         """The clock that stamps the data went back, see :meth:`OnlineEstimator.clock_went_back`; the options decide."""
+        if from_ns is not None and from_ns - now_ns <= self.options.time_jump_ns:
+            return  # two that publish the clock, or messages that overtake each other
         tracks, data_time_ns = self.content.builder.tracks, self.content.state.growth.newest_ns
         if data_time_ns is None or data_time_ns - now_ns <= self.options.time_jump_ns:
             return  # no data from after it are known, or odometry has shown the jump already

@@ -105,6 +105,8 @@ class OnlineEstimator:
     def clock_went_back(self, now_ns: int, from_ns: int | None = None) -> None:
         """The clock that stamps the data (``/clock``) went back; treated as if odometry had shown it.
 
+        Going back by less than the options' ``time_jump_s`` is no jump.
+
         Args:
             now_ns: what it shows now.
             from_ns: what it showed before. Odometry up to then may still be under way; it belongs to the time before.

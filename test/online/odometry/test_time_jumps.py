@@ -306,6 +306,19 @@ def test_with_reset_odometry_of_another_clock_goes_on() -> None:
     assert online.counts().keyframes == LENGTH - 40
 
 
+@pytest.mark.parametrize("policy", ["new_component", "reset"])
+def test_a_clock_that_goes_back_by_less_than_a_jump_changes_nothing(policy: str) -> None:
+    """As where two publish it; the stamps of another computer's odometry are ahead of it by more than a jump."""
+    online = estimator(policy)
+    feed(online, range(LENGTH))
+    online.clock_went_back(2 * SECOND - 10**6, 2 * SECOND)
+    assert online.time_jumps == 0 and online.counts().keyframes == LENGTH
+    assert online.add_edge(closure(1, 0, 2 * SECOND)) is None
+    assert ends(online) == [(0, 20)], "which time its stamps are of is clear"
+    online.clock_went_back(0, 2 * SECOND)
+    assert online.time_jumps == 1
+
+
 def test_odometry_that_does_not_follow_the_clock_goes_on() -> None:
     online = estimator("new_component")
     feed(online, range(40))
