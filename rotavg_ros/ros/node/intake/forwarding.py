@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import groupby
 from typing import Any, TypeGuard
 
 from rclpy.node import Node
@@ -66,7 +67,10 @@ class Forward:
 
 
 class ArrayForward(Forward):
-    """Forwards ``rotavg_msgs/RelativeRotationArray``: edges that pass together are sent together."""
+    """Forwards ``rotavg_msgs/RelativeRotationArray``: edges that pass together are sent together.
+
+    The header of an array names the frame of those of its edges that name none, so frames stay apart.
+    """
 
     def __init__(self, edges: EdgeTopic, output: Publisher) -> None:
         super().__init__(edges.topic, output)
@@ -78,9 +82,10 @@ class ArrayForward(Forward):
                 yield replace(record, element=(message.header, record.element))
 
     def send(self, items: list[Any]) -> None:
-        if items:
-            header = as_message(items[-1][0], Header)
-            edges = [as_message(element, self._element_type) for _, element in items]
+        for _, of_frame in groupby(items, key=lambda item: item[0].frame_id):
+            together = list(of_frame)
+            header = as_message(together[-1][0], Header)
+            edges = [as_message(element, self._element_type) for _, element in together]
             self._output.publish(self._message_type(header=header, edges=edges))
 
 

@@ -8,10 +8,13 @@ from types import SimpleNamespace as Fields
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
+from rotavg_msgs.msg import RelativeRotation, RelativeRotationArray
+from std_msgs.msg import Header
+
 from rotavg_ros.inputs import EdgeRecord, Source
 from rotavg_ros.online import EdgeMeasurement, KeyframeReference, OnlineEstimator
 from rotavg_ros.ros.node.intake import adapters
-from rotavg_ros.ros.node.intake.forwarding import Forwarding, WholeGraphForward
+from rotavg_ros.ros.node.intake.forwarding import ArrayForward, Forwarding, WholeGraphForward
 from rotavg_ros.settings.parameters import NodeParameters
 
 
@@ -133,3 +136,16 @@ def test_a_closure_that_was_given_up_and_is_sent_again_goes_out_once(probe_node)
     assert forwarding.waiting == 1 and not forward.shares_names
     forwarding.decide(online.tick())
     assert sent == ["it"] and forwarding.waiting == 0
+
+
+def test_edges_of_an_array_stay_in_its_frame() -> None:
+    """Two cameras on one topic: what passed together went out under the last one's frame."""
+    sent: list[RelativeRotationArray] = []
+    entry = adapters.edge_topic("arrays:rotavg_msgs/msg/RelativeRotationArray", Source("r"))
+    forward = ArrayForward(entry, Fields(publish=sent.append))
+    frames = ["front", "front", "rear", "rear", "front"]
+    forward.send([(Header(frame_id=frame), RelativeRotation(id=number)) for number, frame in enumerate(frames)])
+    told = [(array.header.frame_id, [edge.id for edge in array.edges]) for array in sent]
+    assert told == [("front", [0, 1]), ("rear", [2, 3]), ("front", [4])]
+    forward.send([])
+    assert len(sent) == 3
