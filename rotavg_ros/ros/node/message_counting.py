@@ -66,6 +66,11 @@ class SequenceGaps:
             self._gaps.append((before, number))
         del self._counts[:-_MOST_COUNTS], self._gaps[:-_MOST_COUNTS]
 
+    def interrupt(self) -> None:
+        """Numbers are missed from now on that say nothing of losses: the next one begins a count."""
+        self._counts.clear()
+        self._gaps.clear()
+
     def _is_new(self, name: str) -> bool:
         """Whether no message has come with this name before."""
         is_new = name not in self._names
@@ -95,10 +100,14 @@ class TopicCounter:
         Args:
             info: rclpy's message info; None if rclpy provides none.
             num_publishers: number of publishers. The middleware's numbers are per publisher and do not say which, so
-                they count only while there is one.
+                they count only while there is one. One that was killed still counts as a second for some seconds.
         """
         self.received += 1
-        if info is not None and num_publishers == 1:
+        if info is None:
+            return
+        if num_publishers != 1:
+            self.by_middleware.interrupt()
+        else:
             self.by_middleware.observe("", info.get("publication_sequence_number") or 0)
 
     @property

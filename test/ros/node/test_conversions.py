@@ -177,6 +177,17 @@ def test_the_middlewares_numbers_count_only_for_a_single_publisher() -> None:
     assert (counter.received, counter.by_middleware.lost, counter.lost) == (5, 1, 1)
 
 
+def test_a_publisher_that_was_killed_and_starts_again_has_lost_nothing() -> None:
+    """For twenty seconds DDS has two of them; when it has one again, that one's numbers have gone on."""
+    counter = TopicCounter()
+    for numbers, publishers in ((range(1, 101), 1), (range(1, 174), 2), (range(174, 200), 1)):
+        for number in numbers:
+            counter.observe({"publication_sequence_number": number}, publishers)
+    assert (counter.received, counter.lost, counter.before_first) == (299, 0, 0)
+    counter.observe({"publication_sequence_number": 203}, 1)
+    assert counter.lost == 3
+
+
 def test_durations() -> None:
     durations = Durations(length=3)
     assert math.isnan(durations.percentile_ms(50))
