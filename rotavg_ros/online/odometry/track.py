@@ -21,6 +21,10 @@ from rotavg_ros.online.odometry.continuity import ANY_MOTION, ContinuityCheck, C
 from rotavg_ros.online.odometry.keyframe_choice import KeyframePolicy
 from rotavg_ros.online.odometry.samples import OdometryBounds, OdometrySamples
 from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.stamps import NANOSECONDS
+
+# The clock cannot overtake odometry by more than this: edges by stamp wait for the first message from after it.
+_LONGEST_UNDER_WAY_NS = 60 * NANOSECONDS
 
 
 class OdometryTrack:
@@ -66,9 +70,10 @@ class OdometryTrack:
     def awaits_time_line(self) -> bool:
         """Whether the clock went back, and no message from after it has come yet.
 
-        Odometry that goes on for ``lead_ns`` as if nothing had happened is stamped by another clock.
+        Odometry that goes on for ``lead_ns``, or for a minute, as if nothing had happened is stamped by another clock.
         """
         at, latest, lead_ns = self._clock_went_back_at, self.latest, self._continuity.limits.lead_ns
+        lead_ns = min(lead_ns, _LONGEST_UNDER_WAY_NS)
         return at is not None and latest is not None and latest.stamp_ns - at <= lead_ns
 
     def comes_after_the_clock(self, stamp_ns: int, time_jump_ns: int) -> bool:

@@ -319,8 +319,11 @@ def test_a_clock_that_goes_back_by_less_than_a_jump_changes_nothing(policy: str)
     assert online.time_jumps == 1
 
 
-def test_odometry_that_does_not_follow_the_clock_goes_on() -> None:
+@pytest.mark.parametrize("max_lead_s", [60.0, 0.0, 1e6])
+def test_odometry_that_does_not_follow_the_clock_goes_on(max_lead_s: float) -> None:
+    """Also where any stamp is believed: edges by stamp had then waited for good."""
     online = estimator("new_component")
+    online.set_options(replace(online.options, max_stamp_lead_s=max_lead_s))
     feed(online, range(40))
     online.clock_went_back(0)
     assert online.add_edge(closure(1, 2 * SECOND, 3 * SECOND)) is None and online.counts().pending == 1
