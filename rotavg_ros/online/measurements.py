@@ -148,6 +148,10 @@ class EdgeMeasurement:
         target_from_source = quaternion.inverse((x, y, z, w))
         return cls(edge_id, source, target, target_from_source, precision=precision, translation=translation)
 
+    def has_moment_of(self, robot: str) -> bool:
+        """Whether one of its ends is a stamp of this robot."""
+        return any(end.robot == robot and end.keyframe_id is None for end in (self.source, self.target))
+
     def fingerprint(self, time_lines: tuple[int, int] = (0, 0)) -> int:
         """64 bits that agree for a retransmission (same id, ends and rotation) and, in practice, for nothing else.
 

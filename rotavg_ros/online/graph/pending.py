@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
-from rotavg_ros.online.measurements import MAX_STAMP_NS, EdgeMeasurement, KeyframeReference
+from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference
 
 
 @dataclass(slots=True)
@@ -103,8 +103,13 @@ class PendingEdges:
         return [self._remove(serial) for serial in list(self._undecided.get(robot, ()))]
 
     def pop_of_time_line(self, robot: str) -> list[EdgeMeasurement]:
-        """Take out the edges that wait for a moment of a robot on a time line that has ended."""
-        return self.pop_until(robot, MAX_STAMP_NS)
+        """Take out the edges about a moment of a robot on a time line that has ended, whichever end they wait for.
+
+        Undecided ones stay: they may be about the next time line.
+        """
+        decided = ((serial, waiting.edge) for serial, waiting in self._waiting.items() if not waiting.is_undecided)
+        ended = [serial for serial, edge in decided if edge.has_moment_of(robot)]
+        return [self._remove(serial) for serial in ended]
 
     def restart_timeouts(self, robot: str) -> None:
         """A robot's data time went back: the timeouts that count in it start again."""

@@ -28,10 +28,6 @@ class Provisional:
     waits_for: KeyframeReference
     row: int
 
-    def has_moment_of(self, robot: str) -> bool:
-        """Whether one of its ends is a stamp of this robot."""
-        return any(end.robot == robot and end.keyframe_id is None for end in (self.edge.source, self.edge.target))
-
 
 class ProvisionalEdges:
     """Those of a graph's edges whose place is not final, by the robot whose odometry they wait for."""
@@ -62,7 +58,7 @@ class ProvisionalEdges:
 
     def end_time_line(self, robot: str) -> None:
         """A robot's clock went back, and its stamps may mean other moments: edges with one stay where they are."""
-        self._keep(each for each in self.all() if not each.has_moment_of(robot))
+        self._keep(each for each in self.all() if not each.edge.has_moment_of(robot))
 
     def renumber(self, renumbering: Renumbering) -> None:
         """Follow a compaction of the graph; the places of edges that were merged, if any, become final."""

@@ -238,6 +238,28 @@ def test_what_waited_at_the_jump(solver, policy: str) -> None:
     assert online.counts().rejected.get("stamp_out_of_range", 0) == int(begins)
 
 
+def test_what_waited_for_another_robot_at_the_jump_is_not_about_the_new_time(kept) -> None:
+    """It had been tied to where the robot was at that stamp the second time: a false closure between robots."""
+
+    def other(indices: range) -> None:
+        for index in indices:
+            kept.add_odometry("other", index * SECOND // 10, rotation(index))
+
+    source, target = KeyframeReference("r", stamp_ns=3 * SECOND), KeyframeReference("other", stamp_ns=4 * SECOND)
+    between = EdgeMeasurement(1, source, target, turn(30, 40))
+    feed(kept, range(LENGTH))
+    other(range(35))
+    assert kept.add_edge(between) is None and kept.counts().pending == 1
+    feed(kept, range(LENGTH))
+    assert kept.counts().pending == 0 and kept.counts().rejected == {"stamp_out_of_range": 1}
+    other(range(35, LENGTH))
+    assert ends(kept) == []
+    assert kept.add_edge(between) is None, "what is sent from now on means the new time"
+    snapshot = kept.snapshot()
+    ((node, _),) = ends(kept)
+    assert (snapshot.keyframe_id[node], snapshot.time_line[node]) == (LENGTH + 30, 1)
+
+
 def test_waiting_edges_time_out_on_the_new_time_line(solver) -> None:
     options = EstimatorOptions(keyframe_angle=0, keyframe_distance=0, pending_timeout_s=3.0)
     online = OnlineEstimator(options, solver)
