@@ -71,7 +71,7 @@ class KeyframeOdomConverter:
         self._last_id, self._last, self._before = keyframe_id, now, last.odometry if last else None
         if last is None:
             return None
-        if has_jumped(sample, last.odometry, before, self._source.limits):
+        if has_jumped(sample, last.odometry, before, self._source.limits()):
             self._before = None
             return None
         edge = self._edge(edge_id_of(*ends, EdgeKind.ODOMETRY), last, now)

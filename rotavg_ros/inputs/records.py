@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
 
 from rotavg_ros.inputs.fields import Key
-from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason
+from rotavg_ros.online import EdgeMeasurement, KeyframeReference, OnlineEstimator, RejectReason
 from rotavg_ros.online.odometry.continuity import ANY_MOTION, ContinuityLimits
 from rotavg_ros.online.quaternion import IDENTITY, Quaternion, Vector, multiply
 from rotavg_ros.view_graph import EdgeLabel
@@ -23,7 +23,7 @@ class Source:
         robot: the robot that they belong to if they name none.
         robots: names of all robots, for messages that number them.
         body_from_sensor: orientation, in the body frame, of the sensor frame in which the messages state rotations.
-        limits: largest believable change of odometry from one keyframe to the next.
+        limits: gives the largest believable change of odometry from one keyframe to the next, as it is now.
         odometry_between: target_from_source of the odometry edge that the graph has from one keyframe to another, None
             if there is none: a graph may have been loaded, or built from other topics.
     """
@@ -31,8 +31,13 @@ class Source:
     robot: str
     robots: tuple[str, ...] = ()
     body_from_sensor: Quaternion = IDENTITY
-    limits: ContinuityLimits = ANY_MOTION
+    limits: Callable[[], ContinuityLimits] = lambda: ANY_MOTION
     odometry_between: Callable[[Key, Key], Quaternion | None] = lambda source, target: None
+
+    def into(self, estimator: OnlineEstimator) -> Source:
+        """The same, by an estimator's present graph and options."""
+        limits, odometry_between = (lambda: estimator.options.continuity_limits), estimator.odometry_between
+        return replace(self, limits=limits, odometry_between=odometry_between)
 
     def robot_of(self, number: int) -> str:
         """Name of the robot with a number, which is its place in ``robots`` unless robots there are named by numbers.

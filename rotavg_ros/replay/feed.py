@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -54,8 +53,7 @@ class Feed:
             odometry = partial(self._take_odometry, robot, ODOMETRY_CONVERTERS[source.type_name], sensor)
             self._handlers.setdefault(source.topic, []).append(odometry)
         for source, about in zip(plan.edges, parameters.edge_sources(), strict=True):
-            about = replace(about, odometry_between=estimator.odometry_between)
-            convert = EDGE_CONVERTERS[source.type_name](about)
+            convert = EDGE_CONVERTERS[source.type_name](about.into(estimator))
             self._edge_converters.append(convert)
             edges = partial(self._take_edges, convert, source.topic)
             self._handlers.setdefault(source.topic, []).append(edges)

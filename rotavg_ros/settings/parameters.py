@@ -210,8 +210,7 @@ class NodeParameters:
         robots = self.edge_robots * (number // len(self.edge_robots))
         sensors = _orientations(self.edge_sensor_orientations, number)
         pairs = zip(robots, sensors, strict=True)
-        limits = self.estimator.continuity_limits
-        return [Source(robot or self.robots[0], self.robots, sensor, limits) for robot, sensor in pairs]
+        return [Source(robot or self.robots[0], self.robots, sensor) for robot, sensor in pairs]
 
     def values(self) -> dict[str, Any]:
         """All parameters by name, as users write them."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace as Fields
 
 import pytest
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.inputs import EDGE_CONVERTERS, Source
-from rotavg_ros.online import EstimatorOptions, RejectReason
+from rotavg_ros.online import EstimatorOptions, OnlineEstimator, RejectReason
 
 from .square import (
     converter,
@@ -17,6 +18,8 @@ from .square import (
     quaternion,
     stamp,
 )
+
+UPRIGHT = Fields(x=0.0, y=0.0, z=0.0, w=1.0)
 
 
 def test_keyframes_whose_numbers_start_again_begin_a_new_chain() -> None:
@@ -51,7 +54,7 @@ def test_steps_that_contradict_a_graph_that_was_loaded_are_refused(turned_deg: f
 
 def test_keyframes_of_odometry_that_begins_anew_begin_a_new_chain() -> None:
     limits = EstimatorOptions().continuity_limits
-    convert = EDGE_CONVERTERS["cslam_common_interfaces/msg/KeyframeOdom"](Source("b", limits=limits))
+    convert = EDGE_CONVERTERS["cslam_common_interfaces/msg/KeyframeOdom"](Source("b", limits=lambda: limits))
     pairs = []
     for number in range(8):
         pose = Fields(position=Fields(x=20.0 + number if number < 4 else 0.0, y=0.0, z=0.0))
@@ -61,3 +64,22 @@ def test_keyframes_of_odometry_that_begins_anew_begin_a_new_chain() -> None:
             (edge.source.keyframe_id, edge.target.keyframe_id) for edge in edges(convert(Fields(id=number, odom=odom)))
         ]
     assert pairs == [(0, 1), (1, 2), (2, 3), (4, 5), (5, 6), (6, 7)]
+
+
+def test_limits_that_are_changed_apply_from_then_on() -> None:
+    """Parameters of the node are live: it had gone by those that it was started with."""
+    slow = EstimatorOptions(max_speed=1.0)
+    estimator = OnlineEstimator(slow, lambda *_, **__: None)
+    convert = EDGE_CONVERTERS["cslam_common_interfaces/msg/KeyframeOdom"](Source("b").into(estimator))
+
+    def made(numbers: range) -> int:
+        poses = [Fields(position=Fields(x=5.0 * number, y=0.0, z=0.0), orientation=UPRIGHT) for number in numbers]
+        odom = [
+            Fields(header=Fields(stamp=stamp(number)), pose=Fields(pose=pose))
+            for number, pose in zip(numbers, poses, strict=True)
+        ]
+        return sum(len(edges(convert(Fields(id=number, odom=odom[at])))) for at, number in enumerate(numbers))
+
+    assert made(range(5)) == 0
+    estimator.set_options(replace(slow, max_speed=50.0))
+    assert made(range(5, 10)) == 5

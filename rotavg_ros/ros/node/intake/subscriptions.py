@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -77,7 +76,7 @@ class Subscriptions:
             self._subscribe(topic, odometry, on_odometry, counter)
         reliable = QoSProfile(depth=parameters.edge_queue_depth, reliability=ReliabilityPolicy.RELIABLE)
         for entry, source in zip(parameters.edge_topics, parameters.edge_sources(), strict=True):
-            edges = adapters.edge_topic(entry, replace(source, odometry_between=estimator.odometry_between))
+            edges = adapters.edge_topic(entry, source.into(estimator))
             self._intake.add_source(edges.convert)
             topic = Input(self._full_name(edges.topic), edges.type_name, "edge_topics", "", reliable)
             topic.forward = self.forwarding.of(edges)
