@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import gc
 import sys
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
+from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator, RejectReason
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
 SECOND = 1_000_000_000
@@ -108,3 +110,15 @@ def test_it_is_told_when_a_graph_is_full_of_edges_that_cannot_be_spared(label: E
         assert counts.edges <= options.most_edges == 120 and counts.is_full_of_edges == (refused > 0)
     assert refused == (80 if label == EdgeLabel.ACCEPTED else 0) and not counts.is_full
     assert counts.keyframes == 11 and counts.dropped_closures == 0
+
+
+@pytest.mark.parametrize("at_start", [10, 2_000_000])
+def test_repetitions_are_known_within_the_bound_that_holds_now(at_start: int) -> None:
+    """It can be raised while the node runs; a sender that repeated its graph was then taken twice."""
+    options = EstimatorOptions(keyframe_source="edges", max_edges=at_start)
+    online = OnlineEstimator(options, lambda *_, **__: None)
+    online.set_options(replace(options, max_edges=1000))
+    keyframes = [KeyframeReference("r", number) for number in range(101)]
+    steps = [EdgeMeasurement(0, *ends, IDENTITY, EdgeKind.ODOMETRY) for ends in pairwise(keyframes)]
+    assert [online.add_edge(step) for step in steps] == [None] * 100
+    assert [online.add_edge(step) for step in steps] == [RejectReason.DUPLICATE_EDGE] * 100

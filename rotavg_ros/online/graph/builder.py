@@ -54,6 +54,7 @@ class GraphBuilder:
         """Change what applies to inputs from now on: keyframe thresholds, tolerances, gaps."""
         self.growth.options = options
         self._policy = options.keyframe_policy
+        self.growth.fingerprints.capacity = options.max_edges
         for track in self.tracks.values():
             track.set_limits(options.odometry_bounds, options.continuity_limits)
         self.growth.room.try_again()

@@ -15,10 +15,13 @@ class Fingerprints:
     """A set of 64-bit numbers that forgets the oldest.
 
     It holds at least the newest ``capacity`` numbers and at most twice as many.
+
+    Attributes:
+        capacity: may be changed at any time.
     """
 
     def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
+        self.capacity = capacity
         self._newest: set[int] = set()
         # Ascending; when `_younger` is full it becomes `_older`, and the previous `_older` is forgotten.
         self._younger = self._older = np.empty(0, dtype=np.uint64)
@@ -31,12 +34,12 @@ class Fingerprints:
 
     def add(self, number: int) -> None:
         self._newest.add(number)
-        if len(self._newest) >= min(_NEWEST, self._capacity):
+        if len(self._newest) >= min(_NEWEST, self.capacity):
             # Two ascending runs, which a stable sort merges quickly.
             runs = self._younger, np.sort(self._newest_as_array())
             self._younger = np.sort(np.concatenate(runs), kind="stable")
             self._newest = set()
-            if len(self._younger) >= self._capacity:
+            if len(self._younger) >= self.capacity:
                 self._younger, self._older = self._older[:0], self._younger
 
     def arrays(self) -> dict[str, NDArray[np.uint64]]:
