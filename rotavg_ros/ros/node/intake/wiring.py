@@ -161,8 +161,9 @@ class Wiring:
                     lines.append(f"{each.name} comes in frames {named}: a robot's odometry has one source")
         if "edge_sensor_orientations" in self._given or not bodies:
             return lines
+        known = {body.removeprefix("/") for body in bodies}  # tf1 put a '/' before names
         for each in self._inputs:
-            sensors = [] if each.is_odometry else [sensor for sensor in each.sensors if sensor not in bodies]
+            sensors = [] if each.is_odometry else [name for name in each.sensors if name.removeprefix("/") not in known]
             if sensors:
                 lines.append(
                     f"{each.name} is in frame {', '.join(sensors)}, but odometry tells of {', '.join(bodies)}: publish "

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -18,7 +19,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rotavg_msgs.msg import AbsoluteOrientations, KeyframeReference, RelativeRotation, RelativeRotationArray
 from std_msgs.msg import Header
 
-from rotavg_ros.ros.node.intake.wiring import Input
+from rotavg_ros.ros.node.intake.wiring import Input, Wiring
+from rotavg_ros.settings.parameters import NodeParameters
 
 pytestmark = pytest.mark.ros
 
@@ -95,6 +97,22 @@ def test_frames_and_robots_of_edges(live_node) -> None:
     says(live_node, "1 edges are about robots that are not known ('roboter'); known are robot")
     live_node.odometry.publish(odometry(3, "map", "base_link"))
     says(live_node, "/odom comes in frames odom → base_link and map → base_link")
+
+
+def test_the_bodys_frame_is_the_bodys_with_a_slash_in_front_as_well() -> None:
+    """As tf1 wrote names; such edges were said to be in another frame."""
+    node = SimpleNamespace(
+        get_publishers_info_by_topic=lambda _: [],
+        count_publishers=lambda _: 0,
+        get_parameter=lambda _: SimpleNamespace(value=False),
+    )
+    kinds = (("odometry_topics", "robot", ("odom", "base_link")), ("edge_topics", "", ("/base_link",)))
+    inputs = [Input(f"/{kind}", "", kind, robot, QoSProfile(depth=1), {frames: None}) for kind, robot, frames in kinds]
+    wiring = Wiring(node, inputs, [], frozenset())
+    assert wiring.warnings(NodeParameters()) == []
+    inputs[1].note_frames("/camera")
+    (line,) = wiring.warnings(NodeParameters())
+    assert "is in frame /camera, but" in line
 
 
 @pytest.mark.large
