@@ -9,10 +9,10 @@ import resource
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -23,7 +23,7 @@ from rotavg_ros.cli.poses import POSE_FILES, pose_files, write_corrected_poses
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files.csv_writer import Column, edge_columns, orientation_columns, write_csv
 from rotavg_ros.datasets.files.formats import read_graph, stem_of
-from rotavg_ros.datasets.files.graph_file import GraphFile
+from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError
 from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.solver import Solution, methods, solve
 from rotavg_ros.solver.solution import residual_deg, residual_m
@@ -127,9 +127,7 @@ def solve_file(job: Job, solver: _Warm, edges: str, *, poses: bool = False) -> d
     solve_seconds = time.perf_counter() - start
     summary = summarize(job.graph, graph_file, solution, read_seconds, solve_seconds)
     summary["files"] = _files(graph_file, edges, poses=poses)
-    write_answer(job.output, graph_file, solution, summary, edges)
-    if poses:
-        write_corrected_poses(job.output, graph_file, solution)
+    write_answer(job.output, graph_file, solution, summary, edges, poses=poses)
     return summary
 
 
@@ -216,8 +214,16 @@ def summarize(
     }
 
 
-def write_answer(output: Path, graph_file: GraphFile, solution: Solution, summary: dict[str, Any], edges: str) -> None:
-    """Write all files under temporary names, then move them in place; edges and poses of an older answer are deleted.
+def write_answer(
+    output: Path,
+    graph_file: GraphFile,
+    solution: Solution,
+    summary: dict[str, Any],
+    edges: str,
+    *,
+    poses: bool = False,
+) -> None:
+    """Write all files into a temporary folder, then move them in place; other files of an older answer are deleted.
 
     Raises:
         SolveError: the folder cannot be written; an older answer is then still intact.
@@ -232,23 +238,30 @@ def write_answer(output: Path, graph_file: GraphFile, solution: Solution, summar
     elif edges == "npz":
         writers[f"{_EDGES}.npz"] = lambda file: np.savez(file, **arrays)
     writers[_SUMMARY] = lambda file: file.write((json.dumps(summary, indent=2) + "\n").encode())
-    temporary = {name: output / f".{name}.{os.getpid()}.tmp" for name in writers}
     try:
         output.mkdir(parents=True, exist_ok=True)
-        older = _older_files(output)
-        for name, write in writers.items():
-            with temporary[name].open("wb") as file:
-                write(file)
-        for name in writers:
-            os.replace(temporary[name], output / name)
-        for name in older - set(summary["files"]):
-            (output / name).unlink(missing_ok=True)
+        with TemporaryDirectory(prefix=".unfinished.", dir=output, ignore_cleanup_errors=True) as workplace:
+            folder = Path(workplace)
+            for name, write in writers.items():
+                with (folder / name).open("wb") as file:
+                    write(file)
+            if poses:
+                _write_poses(folder, output, graph_file, solution)
+            older = _older_files(output)
+            for path in sorted(folder.iterdir()):
+                os.replace(path, output / path.name)
+            for name in older - set(summary["files"]):
+                (output / name).unlink(missing_ok=True)
     except OSError as error:
         raise SolveError(f"{output}: cannot be written: {error.strerror or error}") from None
-    finally:
-        for path in temporary.values():
-            with suppress(OSError):  # if it is not a folder, there is nothing to remove in it
-                path.unlink()
+
+
+def _write_poses(folder: Path, output: Path, graph_file: GraphFile, solution: Solution) -> None:
+    """Write the poses' files into the temporary folder of ``output``, whose name no message may tell."""
+    try:
+        write_corrected_poses(folder, graph_file, solution)
+    except GraphFileError as error:
+        raise SolveError(str(error).replace(str(folder), str(output))) from None
 
 
 def _orientation_columns(graph_file: GraphFile, solution: Solution) -> list[Column]:

@@ -50,6 +50,31 @@ def test_a_graph_is_not_overwritten_by_its_own_answer(tmp_path: Path, capsys: py
     assert "would be overwritten" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("end", [KeyboardInterrupt, OSError(28, "No space left on device")])
+def test_an_answer_takes_an_older_ones_place_as_a_whole(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    end: type[BaseException] | OSError,
+) -> None:
+    for seed in (0, 1):
+        run = simulate_slam_graph(SlamSimulationConfig(num_keyframes=100), np.random.default_rng(seed))
+        write_graph(tmp_path / f"{seed}.npz", run.to_graph_file())
+    out = tmp_path / "out"
+    assert main(["solve", str(tmp_path / "0.npz"), "--poses", "--output", str(out)]) == 0
+    older = {path.name: path.read_bytes() for path in out.iterdir()}
+
+    def write_rows(*_: object) -> None:
+        raise end
+
+    monkeypatch.setattr("rotavg_ros.datasets.files.pose_files.write_rows", write_rows)
+    words = ["solve", str(tmp_path / "1.npz"), "--poses", "--output", str(out)]
+    assert main(words) == (2 if isinstance(end, OSError) else 130)
+    if isinstance(end, OSError):
+        assert f"{out}/trajectory.kitti: cannot be written: No space left" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == older
+
+
 def test_an_older_answers_poses_go_and_others_graphs_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = simulate_slam_graph(SlamSimulationConfig(num_keyframes=100), np.random.default_rng(0))
     write_graph(tmp_path / "run.npz", run.to_graph_file())
