@@ -14,9 +14,13 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 
 from rotavg_ros.bags import bulk
 from rotavg_ros.bags.message_types import typestore
+from rotavg_ros.bags.reader import COMPRESSED_SUFFIX
 from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.whole_file import real
 
+_METADATA = "metadata.yaml"
+# How the names of a recorder's other files end; sqlite keeps two beside a database that is being written.
+_OF_RECORDER = (".mcap", ".db3", ".db3-wal", ".db3-shm", COMPRESSED_SUFFIX)
 _UNLIMITED = QosTime(2147483647, 4294967295)
 
 
@@ -29,7 +33,7 @@ class BagWriter:
 
     Args:
         path: the bag's folder, which must not exist.
-        overwrite: replace an existing bag (only a folder that is a bag, or an empty one).
+        overwrite: replace an existing bag (only a folder that is a bag and nothing else, or an empty one).
         compressed: whether to compress chunks with zstd.
 
     Raises:
@@ -124,14 +128,16 @@ class BagWriter:
 
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:
-    """Refuse to replace a bag without ``overwrite``, and anything that is not a bag in any case.
+    """Refuse to replace a bag without ``overwrite``, and in any case what is not a bag, or a bag with others' files.
 
     Raises:
         BagWriteError: something is at the bag's place.
     """
     with asking_about(path, BagWriteError):
         exists = path.exists()
-        may_go = exists and path.is_dir() and _is_bag_or_empty(list(path.iterdir()))
+        content = sorted(path.iterdir()) if path.is_dir() else []
+        may_go = path.is_dir() and _is_bag_or_empty(content)
+        others = [each.name for each in content if not _is_of_bag(each)]
         is_here = may_go and real(path) in (Path.cwd(), *Path.cwd().parents)
     if not exists:
         return
@@ -139,9 +145,21 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
         raise BagWriteError(f"{path}: exists already; choose another --output or give --overwrite")
     if not may_go:
         raise BagWriteError(f"{path}: is not a bag, so --overwrite leaves it alone; choose another --output")
+    if others:
+        raise BagWriteError(
+            f"{path}: holds {others[0]} as well, which is not the bag's and would be deleted; move it away or choose "
+            "another --output"
+        )
     if is_here:
         raise BagWriteError(f"{path}: is the folder you are in, so it cannot be replaced; choose another --output")
 
 
 def _is_bag_or_empty(content: Sequence[Path]) -> bool:
-    return not content or any(path.name == "metadata.yaml" for path in content)
+    return not content or any(path.name == _METADATA for path in content)
+
+
+def _is_of_bag(path: Path) -> bool:
+    """Whether a file in a bag's folder is the recorder's; a folder counts if it is empty."""
+    if path.is_dir() and not path.is_symlink():
+        return not any(path.iterdir())
+    return path.name == _METADATA or path.name.endswith(_OF_RECORDER)

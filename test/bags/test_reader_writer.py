@@ -109,6 +109,27 @@ def test_overwrite_spares_what_is_not_a_bag(tmp_path: Path) -> None:
         write_odometry(tmp_path / "file", overwrite=True)
 
 
+@pytest.mark.parametrize("name", ["notes.txt", "answer/report.html"])
+def test_overwrite_spares_a_bag_with_files_that_are_not_its_own(tmp_path: Path, name: str) -> None:
+    write_odometry(tmp_path / "run", 5)
+    mine = tmp_path / "run" / name
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("by hand")
+    with pytest.raises(BagWriteError, match=f"run: holds {name.split('/')[0]} as well, .* move it away"):
+        write_odometry(tmp_path / "run", 3, overwrite=True)
+    assert mine.read_text() == "by hand"
+    with BagReader(tmp_path / "run") as bag:
+        assert bag.num_messages() == 5
+
+
+def test_overwrite_replaces_whatever_a_recorder_has_left(tmp_path: Path) -> None:
+    write_odometry(tmp_path / "run", 5)
+    for name in ("run_1.mcap", "run_2.mcap.zstd", "run_0.db3", "run_0.db3-wal", "run_0.db3-shm"):
+        (tmp_path / "run" / name).touch()
+    write_odometry(tmp_path / "run", 3, overwrite=True)
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"metadata.yaml", "run.mcap"}
+
+
 def test_a_bag_behind_a_link_is_written_where_it_lies(tmp_path: Path) -> None:
     write_odometry(tmp_path / "disk" / "run", 5)
     (tmp_path / "link").symlink_to(tmp_path / "disk" / "run")
