@@ -27,6 +27,11 @@ from rotavg_ros.replay.summary import summarize
 RECORDING = "run.mcap"
 SUMMARY = "summary.json"
 
+# What an answer has of whatever robot; those that are named by robots and pictures are not known before.
+_USUAL = (
+    *(RECORDING, SUMMARY, "orientations.csv", "edges.csv", "graph.g2o", "report.html"),
+    *("trajectory.tum", "trajectory.kitti", "odometry.tum"),
+)
 _UNFINISHED = ".unfinished."  # followed by the process id
 
 
@@ -42,16 +47,24 @@ def output_folder(folder: Path, *, overwrite: bool) -> Iterator[tuple[Path, bool
     folder stays. Yields the temporary folder, and whether an older replay's answer is to be replaced.
 
     Raises:
-        OutputError: the folder is not empty (without ``overwrite``), or cannot be written.
+        OutputError: the folder is not empty (without ``overwrite``), has a file that would be replaced though no older
+            answer lists it as its own, or cannot be written.
     """
     with asking_about(folder, OutputError):
         is_new, is_folder = not folder.exists(), folder.is_dir()
         left_over = [path for path in folder.iterdir() if _is_left_over(path)] if is_folder else []
-        has_content = is_folder and any(path not in left_over for path in folder.iterdir())
+        content = [path for path in folder.iterdir() if path not in left_over] if is_folder else []
     if not is_new and not is_folder:
         raise OutputError(f"{folder} is not a folder; choose another --output")
-    if has_content and not overwrite:
+    if content and not overwrite:
         raise OutputError(f"{folder}: exists already; choose another --output or give --overwrite")
+    older = _files_of(folder)
+    others = sorted(path.name for path in content if path.name in _USUAL and path.name not in older)
+    if others:
+        raise OutputError(
+            f"{folder / others[0]} would be overwritten, though no earlier answer there lists it as its own; move it "
+            "away or choose another --output"
+        )
     workplace = folder / f"{_UNFINISHED}{os.getpid()}"
     try:
         workplace.mkdir(parents=True)
@@ -91,7 +104,8 @@ def _files_of(folder: Path) -> list[str]:
         names = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["files"]
     except (OSError, ValueError, KeyError, TypeError):
         return []
-    return [name for name in names if isinstance(name, str) and Path(name).name == name]
+    listed = names if isinstance(names, list) else []  # another program's summary may list anything
+    return [name for name in listed if isinstance(name, str) and Path(name).name == name]
 
 
 def write_tables(folder: Path, record: RunRecord) -> None:

@@ -228,6 +228,27 @@ def test_an_output_that_exists_is_refused_and_then_replaced(
     assert main(["replay", str(small), "--output", str(tmp_path / "file"), "--overwrite"]) == 2
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("graph.g2o", "by hand"),
+        ("orientations.csv", "by hand"),
+        ("summary.json", "{}"),
+        ("summary.json", '{"files": 3}'),
+    ],
+)
+def test_what_no_replay_has_written_is_not_overwritten(
+    tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str], name: str, content: str
+) -> None:
+    mine = tmp_path / "out" / name
+    mine.parent.mkdir()
+    mine.write_text(content)
+    assert main(["replay", str(small), "--output", str(tmp_path / "out"), "--overwrite", "--no-report"]) == 2
+    assert f"{mine} would be overwritten" in capsys.readouterr().err
+    assert mine.read_text() == content
+    assert list(mine.parent.iterdir()) == [mine]
+
+
 def test_a_reference_that_loses_its_position_now_and_then(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag") as bag:
         for topic in ("/odom", "/ground_truth"):
