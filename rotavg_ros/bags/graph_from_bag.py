@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,9 @@ from rotavg_ros.bags.topics import (
 from rotavg_ros.datasets.files.graph_file import MAX_NODE_ID, GraphFile
 from rotavg_ros.datasets.interpolation import poses_at
 from rotavg_ros.datasets.planar import are_about_z, are_level
+from rotavg_ros.inputs.records import Source
+from rotavg_ros.inputs.rotavg import edge_from_message
+from rotavg_ros.online.measurements import RejectedInputError, RejectReason, checked_edge
 from rotavg_ros.view_graph import EdgeKind, ViewGraphError, where_possible
 
 # Largest difference between a stamp that names a keyframe and the stamp of its odometry message.
@@ -37,6 +41,19 @@ _MAX_KEYFRAME_DISTANCE_NS = 50_000_000
 _EDGES = {EDGE_TOPIC: RELATIVE_ROTATION, EDGE_ARRAY_TOPIC: RELATIVE_ROTATION_ARRAY}
 
 _REPEATED = "edges that are sent again"
+_NO_ROTATION, _NO_END = "edges whose rotation is none", "edges with an end that cannot be read"
+# Why the estimator refuses an edge whatever the graph; those with both ends at one are counted later.
+_WHY_LEFT_OUT = {
+    RejectReason.NAN_ROTATION: _NO_ROTATION,
+    RejectReason.ZERO_QUATERNION: _NO_ROTATION,
+    RejectReason.UNNORMALIZED_QUATERNION: _NO_ROTATION,
+    RejectReason.BAD_KIND: "edges of an unknown kind",
+    RejectReason.BAD_PRECISION: "edges with a precision that is negative or not finite",
+    RejectReason.BAD_REFERENCE: _NO_END,
+    RejectReason.BAD_STAMP: _NO_END,
+    RejectReason.WRONG_LENGTH: "edges with a translation that has not three numbers",
+}
+_ROBOT = Source("robot")  # only to read messages; a graph is of one robot, whatever its name
 
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 
@@ -51,6 +68,7 @@ class _Content:
     note: dict[str, Any] = field(default_factory=dict)
     edge_topics: str = ""
     repeated: int = 0
+    left_out: Counter[str] = field(default_factory=Counter)
     warnings: tuple[str, ...] = ()
 
     @property
@@ -70,9 +88,9 @@ def read_graph_bag(path: str | Path) -> GraphFile:
     Where the edges name their ends by id, they are the graph, in the order of the edges' own numbers. Where they name
     them by stamp, every odometry message that the estimator would take is a keyframe, consecutive ones are joined by
     odometry edges except where odometry begins anew, and an end belongs to the nearest of them within 0.05 s. Edges
-    without such a message are skipped and counted, as are those that are the same as one before, since the sender has
-    repeated itself. Edges between sensors are converted to the body's frame by the bag's static transforms. From a
-    damaged bag, everything that can be read is used.
+    without such a message are skipped and counted, as are those that the estimator would refuse, and those that are the
+    same as one before, since the sender has repeated itself. Edges between sensors are converted to the body's frame by
+    the bag's static transforms. From a damaged bag, everything that can be read is used.
 
     Raises:
         BagReadError: an unreadable bag, one without edges, or one that needs odometry and has none, or odometry whose
@@ -82,6 +100,8 @@ def read_graph_bag(path: str | Path) -> GraphFile:
         if bag.topics.get(EDGE_ARRAY_TOPIC) != RELATIVE_ROTATION_ARRAY:
             bag.require(EDGE_TOPIC, RELATIVE_ROTATION)
         content = _read(bag)
+        if content.left_out and not content.edges:
+            raise BagReadError(f"{path}: {content.edge_topics}: no edge can be used; {_listed(content.left_out)}")
         if not content.by_id:
             bag.require(ODOM_TOPIC, ODOMETRY)
             if not any(map(is_sound, content.odometry)):
@@ -107,8 +127,9 @@ def _read(bag: BagReader) -> _Content:
     content.edge_topics = ", ".join(topic for topic in topics if topic in _EDGES)
     for topic, _, message in bag.decoded([*topics, *transforms]):
         if topic == EDGE_TOPIC:
-            content.edges.append(read_edge(message))
+            content.edges += map(read_edge, _sound([message], content.left_out))
         elif topic == EDGE_ARRAY_TOPIC:
+            message.edges = list(_sound(message.edges, content.left_out))
             content.edges += read_edges(message)
         elif topic == ODOM_TOPIC:
             content.odometry.append(read_odometry(message))
@@ -124,6 +145,18 @@ def _read(bag: BagReader) -> _Content:
     return content
 
 
+def _sound(messages: Iterable[Any], left_out: Counter[str]) -> Iterator[Any]:
+    """The messages of edges that the estimator would not refuse whatever the graph; the others are counted."""
+    for message in messages:
+        try:
+            checked_edge(edge_from_message(message, _ROBOT))
+        except RejectedInputError as rejection:
+            if rejection.reason in _WHY_LEFT_OUT:
+                left_out[_WHY_LEFT_OUT[rejection.reason]] += 1
+                continue
+        yield message
+
+
 def _check(path: str | Path, content: _Content) -> None:
     """Refuse content that a graph cannot hold."""
     ends = [end for edge in content.edges for end in (edge.source, edge.target)]
@@ -133,10 +166,6 @@ def _check(path: str | Path, content: _Content) -> None:
         raise BagReadError(f"{path}: edges of several robots ({names}); a graph has room for one")
     if content.by_id and (largest := max(end.id or 0 for end in ends)) > MAX_NODE_ID:
         raise BagReadError(f"{path}: keyframe id {largest} is too large; the largest possible is {MAX_NODE_ID}")
-    known = {kind.value for kind in EdgeKind}
-    for edge in content.edges:
-        if edge.kind not in known:
-            raise BagReadError(f"{path}: edge {edge.id} is of the unknown kind {edge.kind}")
 
 
 def _from_ids(content: _Content) -> GraphFile:
@@ -157,7 +186,9 @@ def _from_ids(content: _Content) -> GraphFile:
         precision=np.array([edge.precision for edge in edges]),
         planar=bool(note.get("planar", are_about_z(source_from_target) and are_level(translations))),
         edge_translation=translations,
-        skipped=_counted({"self-edges": len(content.edges) - len(proper), _REPEATED: content.repeated}),
+        skipped=_counted(
+            {"self-edges": len(content.edges) - len(proper), _REPEATED: content.repeated, **content.left_out}
+        ),
     )
     stated = [end for edge in edges for end in (edge.source, edge.target) if end.stamp_ns]
     stamp_of = {end.id: end.stamp_ns for end in stated}
@@ -191,6 +222,7 @@ def _from_stamps(content: _Content) -> GraphFile:
     skipped |= {
         "edges without odometry at their stamps, or with both ends at one": int((~usable).sum()),
         _REPEATED: content.repeated,
+        **content.left_out,
     }
     graph_file = GraphFile.from_ids(
         source[order],
@@ -216,6 +248,10 @@ def _told_of_parts(num_anew: int) -> tuple[str, ...]:
 
 def _counted(skipped: dict[str, int]) -> dict[str, int]:
     return {what: count for what, count in skipped.items() if count}
+
+
+def _listed(counts: Counter[str]) -> str:
+    return ", ".join(f"{count} × {what}" for what, count in counts.items())
 
 
 def _translations(edges: Sequence[Edge]) -> NDArray[np.float64]:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -221,11 +222,19 @@ def test_a_robots_run_reads_back_as_its_graph(tmp_path: Path, dimensions: int) -
     assert read.planar == (dimensions == 2)
 
 
-def bag_of_edges(path: Path, edges: list[Edge]) -> Path:
+def bag_of_edges(path: Path, edges: list[Edge], odometry_ns: Sequence[int] = (), *, in_array: bool = False) -> Path:
+    """A bag of these edges, after odometry that stands still at these moments."""
+    messages = list(map(edge_message, edges))
     with BagWriter(path) as bag:
-        bag.add_topic(EDGE_TOPIC, RELATIVE_ROTATION)
-        for edge in edges:
-            bag.write(EDGE_TOPIC, edge.stamp_ns, edge_message(edge))
+        topic, kind = (EDGE_ARRAY_TOPIC, RELATIVE_ROTATION_ARRAY) if in_array else (EDGE_TOPIC, RELATIVE_ROTATION)
+        bag.add_topic(topic, kind)
+        if odometry_ns:
+            bag.add_topic(ODOM_TOPIC, ODOMETRY)
+        for stamp in odometry_ns:
+            bag.write(ODOM_TOPIC, stamp, odometry_message(stamp, np.zeros(3), np.array([0, 0, 0, 1.0]), "odom"))
+        after = max(odometry_ns, default=0)
+        for message in [typestore().types[kind](messages[0].header, messages)] if in_array else messages:
+            bag.write(topic, after + message.header.stamp.nanosec, message)
     return path
 
 
@@ -257,9 +266,12 @@ def test_a_stamp_that_is_not_stated_is_none(tmp_path: Path, first: int, again: i
     [
         ([edge(0, Keyframe(1, 0, "a"), Keyframe(2, 0, "b"))], "several robots"),
         ([edge(0, Keyframe(1, 0), Keyframe(2**63, 0))], "too large"),
-        ([edge(0, Keyframe(1, 0), Keyframe(2, 0), (0, 0, 0, 0.5))], "unit length"),
-        ([edge(0, Keyframe(1, 0), Keyframe(2, 0), (0, 0, 0, np.nan))], "unit length"),
-        ([replace(edge(0, Keyframe(1, 0), Keyframe(2, 0)), kind=7)], "unknown kind 7"),
+        ([edge(0, Keyframe(1, 0), Keyframe(2, 0), (0, 0, 0, 0.5))], "no edge can be used; 1 × edges whose rotation"),
+        ([edge(0, Keyframe(1, 0), Keyframe(2, 0), (0, 0, 0, np.nan))], "no edge can be used; 1 × edges whose rotation"),
+        (
+            [replace(edge(0, Keyframe(1, 0), Keyframe(2, 0)), kind=7)],
+            "no edge can be used; 1 × edges of an unknown kind",
+        ),
         ([edge(0, Keyframe(None, 0), Keyframe(2, 0))], "no topic /odom"),
         ([], "no topic /odom"),
         ([edge(0, Keyframe(1, 0), Keyframe(1, 0))], "no edge joins two keyframes"),
@@ -271,6 +283,28 @@ def test_what_makes_no_graph_is_refused(tmp_path: Path, edges: list[Edge], compl
         read_graph_bag(bag)
     assert str(caught.value).startswith(str(bag))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("by_stamp", [False, True])
+@pytest.mark.parametrize("in_array", [False, True])
+def test_edges_that_the_estimator_refuses_are_skipped_and_counted(
+    tmp_path: Path, by_stamp: bool, in_array: bool
+) -> None:
+    ends = [Keyframe(None if by_stamp else number, number * 10**9) for number in (1, 2, 3)]
+    good = [edge(number, ends[number], ends[number + 1]) for number in (0, 1)]
+    bad = [
+        *(edge(2, ends[0], ends[2], (0, 0, 0, w)) for w in (0.0, 0.5, np.nan)),
+        replace(edge(3, ends[0], ends[2]), kind=7),
+        replace(edge(4, ends[0], ends[2]), precision=-4.0),
+        replace(edge(5, ends[0], ends[2]), translation=np.zeros(2)),
+        edge(6, ends[0], replace(ends[2], stamp_ns=-(10**9))),
+    ]
+    odometry_ns = [end.stamp_ns for end in ends] if by_stamp else []
+    bag_of_edges(tmp_path / "good", good, odometry_ns, in_array=in_array)
+    bag_of_edges(tmp_path / "all", [*bad, *good], odometry_ns, in_array=in_array)
+    read = read_graph_bag(tmp_path / "all")
+    assert sorted(read.skipped.values()) == [1, 1, 1, 1, 3]
+    assert_same(read, read_graph_bag(tmp_path / "good"))
 
 
 def test_what_odometry_cannot_place_is_skipped_and_counted(tmp_path: Path) -> None:
