@@ -95,10 +95,10 @@ def _check_output(inputs: Sequence[Path], output: Path, *, overwrite: bool) -> N
 def format_of(path: Path) -> ModuleType:
     """The module that reads and writes ``path``."""
     with asking_about(path, ConvertError):
-        is_folder, is_file = path.is_dir(), path.is_file()
+        is_folder, exists = path.is_dir(), path.exists()
     if is_folder:
         chosen = next(known for known in FORMATS if known.is_folder)
-    elif is_file and not path.suffix:
+    elif exists and not path.suffix:  # a file, or a pipe, which is no bag
         chosen = FORMATS[-1]
     else:
         chosen = next((known for known in FORMATS if _suffix_of(path) in known.suffixes), FORMATS[-1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,12 @@ def test_stamps_and_truth(graph_path: Path, tmp_path: Path, capsys: pytest.Captu
     assert main(["convert", str(npz), str(tmp_path / "EGs.txt")]) == 0
     out = capsys.readouterr().out
     assert "no room for: which edges are odometry, precisions, stamps, ground-truth orientations" in out
+
+
+def test_a_pipe_is_no_graph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    assert main(["convert", str(tmp_path / "pipe"), str(tmp_path / "x.g2o")]) == 2
+    assert "pipe: is not a regular file (a pipe or a device); save the graph to one first" in capsys.readouterr().err
 
 
 def test_refusals(graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from types import ModuleType
 
@@ -20,8 +21,14 @@ _FORMAT_OF_SUFFIX = {
 }
 
 
+_SQLITE = b"SQLite format 3"
 # How recordings begin, and their suffixes.
-_RECORDINGS = {b"\x89MCAP": ".mcap", b"SQLite format 3": ".db3", b"#ROSBAG V": ".bag"}
+_RECORDINGS = {b"\x89MCAP": ".mcap", _SQLITE: ".db3", b"#ROSBAG V": ".bag"}
+# A table that other programs' databases have, and what to say of these.
+_DATABASES = {
+    "link": "is RTAB-Map's database; export its graph as g2o (rtabmap-databaseViewer: File, Export poses)",
+    "two_view_geometries": "is COLMAP's database; write its relative rotations as an npz view-graph (docs/formats.md)",
+}
 # Numbers in a row of a trajectory.
 _TRAJECTORIES = {8: "TUM", 12: "KITTI"}
 
@@ -88,6 +95,8 @@ def _format_of_content(path: Path, head: bytes) -> ModuleType:
         return lund
     for start, suffix in _RECORDINGS.items():
         if head.startswith(start):
+            if start == _SQLITE and (database := _database(path)) is not None:
+                raise GraphFileError.at(path, None, database)
             if (packed := how_to_unpack(path, head_of(path))) is not None:
                 raise GraphFileError.at(path, None, packed)
             what = f"is a bag; `rotavg replay` takes it, and `rotavg convert` makes a view-graph of a {suffix} file"
@@ -98,3 +107,16 @@ def _format_of_content(path: Path, head: bytes) -> ModuleType:
         what = f"{len(first_row)} numbers a row, as in a trajectory ({kind}), which has no edges; `rotavg replay "
         raise GraphFileError.at(path, 1, f"{what}--reference` compares with one")
     return onedsfm if first_row[0][:1] in NUMBER_STARTS else g2o
+
+
+def _database(path: Path) -> str | None:
+    """What to say of an SQLite file that is no recording; None: it is one, or its tables cannot be read."""
+    import sqlite3  # which graphs do not need, and some builds of Python lack
+
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
+            tables = {name.lower() for (name,) in database.execute("SELECT name FROM sqlite_master")}
+    except (sqlite3.Error, ValueError):  # a damaged file; a name that is no text
+        return None
+    known = (told for table, told in _DATABASES.items() if table in tables)
+    return next(known, None)

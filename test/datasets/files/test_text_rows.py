@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import gzip
 import os
+import sqlite3
 import threading
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -128,3 +130,22 @@ def test_recordings_and_trajectories_are_no_graphs(tmp_path: Path, content: byte
     path.write_bytes(content)
     with pytest.raises(GraphFileError, match=complaint):
         read_graph(path)
+
+
+@pytest.mark.parametrize(
+    ("tables", "complaint"),
+    [
+        (("Node", "Link"), "is RTAB-Map's database; export its graph as g2o"),
+        (("cameras", "two_view_geometries"), "is COLMAP's database; write its relative rotations as an npz"),
+        (("topics", "messages"), "makes a view-graph of a .db3 file"),
+    ],
+)
+def test_databases_of_others_are_told_from_recordings(tmp_path: Path, tables: tuple[str, ...], complaint: str) -> None:
+    path = tmp_path / "a % map?.db"
+    with closing(sqlite3.connect(path)) as database:
+        for table in tables:
+            database.execute(f"CREATE TABLE {table} (id INTEGER)")
+        database.commit()
+    with pytest.raises(GraphFileError, match=complaint):
+        read_graph(path)
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
