@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.datasets.files.graph_file import GraphFileError, writing
+from rotavg_ros.datasets.files.graph_file import GraphFileError, open_text, writing
 from rotavg_ros.datasets.files.ground_truth import nanoseconds, whole_nanoseconds
 from rotavg_ros.datasets.files.kitti import read_poses
 from rotavg_ros.datasets.files.text_rows import (
@@ -26,6 +28,8 @@ _EXPECTED = (
     "expected TUM (stamp x y z qx qy qz qw), KITTI (12 numbers a row), EuRoC csv (stamp in ns, x, y, z, qw, qx, qy, "
     "qz, …) or csv rows of stamp, x, y, heading"
 )
+# The name of a quaternion's column, as q_RS_w [] or qw, ends in its axis; others' csv files state w last.
+_AXIS = re.compile(rb"([wxyz])[^A-Za-z]*$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,8 @@ def read_pose_file(path: str | Path) -> PoseFile:
         return PoseFile(stamps_ns, numbers[:, :3], unit_quaternions(path, lines, numbers[:, 3:]))
     if columns >= 8 and is_csv:
         stamps_ns, numbers = _by_stamp(path, lines, [row[:8] for row in cells], in_ns=True)
-        return PoseFile(stamps_ns, numbers[:, :3], unit_quaternions(path, lines, numbers[:, [4, 5, 6, 3]]))
+        xyzw = [3 + column for column in _places_of_xyzw(path, lines[0])]
+        return PoseFile(stamps_ns, numbers[:, :3], unit_quaternions(path, lines, numbers[:, xyzw]))
     if columns == 4 and is_csv:
         stamps_ns, numbers = _by_stamp(path, lines, cells)
         position = np.pad(numbers[:, :2], ((0, 0), (0, 1)))
@@ -83,6 +88,19 @@ def _is_heading(cell: bytes) -> bool:
     except ValueError:
         return cell[:1] not in NUMBER_STARTS
     return False
+
+
+def _places_of_xyzw(path: Path, first_line: int) -> list[int]:
+    """Where x, y, z and w are among a csv file's columns 4 to 7: as its header says, else in EuRoC's order, w first.
+
+    Args:
+        first_line: number of the first line of numbers; the header, a comment or not, is above it.
+    """
+    with open_text(path) as file:
+        above = [line for line in islice(file, first_line - 1) if line.strip()]
+    names = above[-1].split(b",")[4:8] if above else []
+    axes = "".join(found[1].decode().lower() if (found := _AXIS.search(name)) else "?" for name in names)
+    return [(axes if sorted(axes) == sorted("wxyz") else "wxyz").index(axis) for axis in "xyzw"]
 
 
 def _by_stamp(path: Path, lines: list[int], cells: list[Row], *, in_ns: bool = False) -> tuple[np.ndarray, np.ndarray]:

@@ -86,6 +86,30 @@ def test_euroc(tmp_path: Path, poses) -> None:
     np.testing.assert_allclose(read.world_from_body, np.roll(by_evo.orientations_quat_wxyz, -1, axis=1), atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("header", "order"),
+    [
+        ("timestamp, p_WS_W_x, p_WS_W_y, p_WS_W_z, q_WS_x, q_WS_y, q_WS_z, q_WS_w, v_WS_W_x\n", "xyzw"),  # OKVIS
+        ("#timestamp [ns],tx,ty,tz,qx,qy,qz,qw\n", "xyzw"),
+        ("# by hand\n\n#timestamp, p_x [m], p_y [m], p_z [m], q_W [], q_X [], q_Y [], q_Z []\n", "wxyz"),
+        ("timestamp,x,y,z,a,b,c,d\n", "wxyz"),
+        ("# of 4 axes, x, y, z\n", "wxyz"),
+        ("", "wxyz"),
+    ],
+)
+def test_the_header_of_a_csv_file_states_the_order_of_its_quaternions(
+    tmp_path: Path, poses, header: str, order: str
+) -> None:
+    stamps_ns, position, orientation = poses
+    stated = orientation[:, ["xyzw".index(axis) for axis in order]]
+    numbers = np.hstack((position, stated, np.ones((COUNT, 3)))).tolist()
+    rows = [",".join(map(repr, [stamp, *row])) for stamp, row in zip(stamps_ns.tolist(), numbers, strict=True)]
+    (tmp_path / "data.csv").write_text(header + "\n".join(rows))
+    read = read_pose_file(tmp_path / "data.csv")
+    np.testing.assert_array_equal(read.stamps_ns, stamps_ns)
+    np.testing.assert_allclose(read.world_from_body, orientation, atol=1e-12)
+
+
 def test_headings_in_the_plane(tmp_path: Path) -> None:
     (tmp_path / "truth.csv").write_text("1.5, 2, 3, 1.5707963267948966\n2.5, 2, 4, 0\n")
     read = read_pose_file(tmp_path / "truth.csv")
