@@ -51,6 +51,10 @@ class UsageError(UserError):
     """Words on the command line that are not a valid command."""
 
 
+class PrintError(UserError):
+    """Standard output that cannot be written, as on a full disk."""
+
+
 class _Parser(argparse.ArgumentParser):
     """Reports mistakes in one line, and accepts an optional last positional argument anywhere, and numbers like -1e-3.
 
@@ -81,6 +85,7 @@ class _Parser(argparse.ArgumentParser):
 
 EXIT_USER_ERROR = 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
+EXIT_NOBODY_READS = 141  # 128 + SIGPIPE
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -91,8 +96,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit code: 0, or 2 for a mistake in what the user gave (one line on stderr), or 130 after Ctrl-C (143 after
-        SIGTERM, 129 after SIGHUP), whether or not what was done by then is written.
+        SIGTERM, 129 after SIGHUP), whether or not what was done by then is written. 141 if the reader of what is
+        printed has closed it: the command may have ended early.
     """
+    try:
+        try:
+            return _run(arguments)
+        finally:
+            _print_the_rest()
+    except BrokenPipeError:  # `| head`
+        _discard_prints()
+        return EXIT_NOBODY_READS
+    except PrintError as error:
+        print_error(error)
+        return EXIT_USER_ERROR
+
+
+def _run(arguments: Sequence[str] | None) -> int:
     is_own_process = arguments is None
     interruption = Interruption(is_own_process)
     arguments = sys.argv[1:] if arguments is None else list(arguments)
@@ -114,13 +134,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print("rotavg: interrupted", file=sys.stderr)
         return interruption.exit_code or EXIT_INTERRUPTED
-    except BrokenPipeError:
-        # The reader of our output (`| head`) has closed it. Python would complain again when it closes stdout.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     finally:
         if is_own_process:
             leave_to_the_system()
+
+
+def _print_the_rest() -> None:
+    """Write out what stdout has buffered, while an error can still be told.
+
+    Raises:
+        BrokenPipeError: nobody reads it.
+        PrintError: it cannot be written.
+    """
+    try:
+        if sys.stdout is not None:  # closed by the caller
+            sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        _discard_prints()
+        raise PrintError(f"what is printed cannot be written: {error.strerror or error}") from None
+
+
+def _discard_prints() -> None:
+    """Python would complain again when it closes stdout."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def print_error(error: UserError) -> None:

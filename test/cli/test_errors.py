@@ -293,9 +293,28 @@ def test_terminal_without_unicode(graph_path: Path, tmp_path: Path, monkeypatch:
     assert (result.returncode, result.stderr) == (0, "")
 
 
-def test_closed_pipe(graph_path: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", ["solve", "convert", "--help"])
+def test_closed_pipe(graph_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
+    """No traceback, and not the exit code of a command that has done all: the second graph is not solved."""
+    monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)  # most of it is then printed at the end
+    second = tmp_path / "second.g2o"
+    second.write_bytes(graph_path.read_bytes())
+    words = {
+        "solve": ("solve", graph_path, second, "--output", tmp_path / "out"),
+        "convert": ("convert", graph_path, tmp_path / "graph.npz"),
+    }.get(command, (command,))
     reader, writer = os.pipe()
     os.close(reader)
-    result = python(ROTAVG, "solve", graph_path, "--output", tmp_path / "out", stdout=writer)
+    result = python(ROTAVG, *words, stdout=writer)
     os.close(writer)
-    assert (result.returncode, result.stderr) == (0, "")
+    assert (result.returncode, result.stderr) == (141, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")
+def test_prints_on_a_full_disk(graph_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)
+    with open("/dev/full", "w") as full:
+        result = python(ROTAVG, "convert", graph_path, tmp_path / "graph.npz", stdout=full.fileno())
+    complaint = "rotavg: error: what is printed cannot be written: No space left on device\n"
+    assert (result.returncode, result.stderr) == (2, complaint)
+    assert (tmp_path / "graph.npz").exists()
