@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 
 from rotavg_ros.datasets.files import g2o, isam, lund, npz, onedsfm, toro
-from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, open_text, reading
+from rotavg_ros.datasets.files.graph_file import GZIP, GraphFile, GraphFileError, open_text, reading
 from rotavg_ros.datasets.files.text_rows import NUMBER_STARTS, read_blocks
 from rotavg_ros.packed import head_of, how_to_unpack
 
@@ -89,10 +89,15 @@ def _format_of_suffix(path: Path) -> ModuleType:
 
 
 def _format_of_content(path: Path, head: bytes) -> ModuleType:
+    binary = None
     if head.startswith(b"PK") or path.suffix.lower() == ".npz":  # npz files are zip archives
-        return npz
-    if head.startswith(b"MATLAB ") or path.suffix.lower() == ".mat":
-        return lund
+        binary = npz
+    elif head.startswith(b"MATLAB ") or path.suffix.lower() == ".mat":
+        binary = lund
+    if binary is not None:
+        if (start := head_of(path)).startswith(GZIP) and (packed := how_to_unpack(path, start)) is not None:
+            raise GraphFileError.at(path, None, packed)  # only texts are read as they are packed
+        return binary
     for start, suffix in _RECORDINGS.items():
         if head.startswith(start):
             if start == _SQLITE and (database := _database(path)) is not None:

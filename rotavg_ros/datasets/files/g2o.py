@@ -106,7 +106,7 @@ def read(path: Path) -> GraphFile:
             elif tag in VERTEX_TAGS:
                 lone_ids.append(_parse_vertices(path, VERTEX_TAGS[tag], lines, rows))
             elif tag in SKIPPED_TAGS or tag.startswith(b"PARAMS"):
-                skipped[tag.decode()] += len(lines)
+                skipped[tag.decode("ascii", "backslashreplace")] += len(lines)
             else:
                 raise GraphFileError.at(path, lines[0], _unknown(tag))
     if not edges:

@@ -31,7 +31,7 @@ _MIN_CHAIN, _CHAIN_SHARE = 10, 0.9
 # Largest number of keyframes in a row that a front end drops again.
 _DROPPED = 30
 
-_GZIP, _ZIP = b"\x1f\x8b", b"PK"
+GZIP, _ZIP = b"\x1f\x8b", b"PK"
 
 
 class GraphFileError(UserError):
@@ -193,7 +193,7 @@ def open_text(path: Path) -> Iterator[io.BufferedReader]:
     """
     with reading(path), ExitStack() as stack:
         file = stack.enter_context(path.open("rb"))
-        if file.peek(len(_GZIP)).startswith(_GZIP):
+        if file.peek(len(GZIP)).startswith(GZIP):
             file = io.BufferedReader(stack.enter_context(gzip.GzipFile(fileobj=file)))
         try:
             start = file.peek(len(codecs.BOM_UTF8))

@@ -254,6 +254,11 @@ def test_nothing_to_solve(tmp_path: Path, text: str, message: str) -> None:
         read_text(tmp_path, text)
 
 
+def test_a_tag_of_parameters_may_be_garbled(tmp_path: Path) -> None:
+    (tmp_path / "graph.g2o").write_bytes(b"PARAMS\xff 0 1\n" + GOOD.encode())
+    assert "PARAMS\\xff" in read_graph(tmp_path / "graph.g2o").skipped
+
+
 def test_what_is_no_file(tmp_path: Path) -> None:
     with pytest.raises(GraphFileError, match="no such file"):
         read_graph(tmp_path / "missing.g2o")

@@ -149,3 +149,12 @@ def test_databases_of_others_are_told_from_recordings(tmp_path: Path, tables: tu
     with pytest.raises(GraphFileError, match=complaint):
         read_graph(path)
     assert [each.name for each in tmp_path.iterdir()] == [path.name]
+
+
+def test_only_texts_are_read_as_they_are_packed(tmp_path: Path, shared_data: Path) -> None:
+    np.savez(tmp_path / "graph.npz", source=[0], target=[1], target_from_source=[[0.0, 0.0, 0.0, 1.0]])
+    for path in (tmp_path / "graph.npz", shared_data / "sfm" / "lund_sphinx.mat"):
+        gzipped = tmp_path / f"{path.name}.gz"
+        gzipped.write_bytes(packed(path.read_bytes()))
+        with pytest.raises(GraphFileError, match=rf"{path.name}.gz: is packed by gzip; unpack it by `gunzip --keep "):
+            read_graph(gzipped)
