@@ -30,6 +30,7 @@ from rotavg_ros.bags.topics import (
 from rotavg_ros.datasets.files.graph_file import MAX_NODE_ID, GraphFile
 from rotavg_ros.datasets.interpolation import poses_at
 from rotavg_ros.datasets.planar import are_about_z, are_level
+from rotavg_ros.inputs import EDGE_CONVERTERS
 from rotavg_ros.inputs.records import Source
 from rotavg_ros.inputs.rotavg import edge_from_message
 from rotavg_ros.online.measurements import RejectedInputError, RejectReason, checked_edge
@@ -98,12 +99,12 @@ def read_graph_bag(path: str | Path) -> GraphFile:
     """
     with BagReader(path, salvage=True) as bag:
         if bag.topics.get(EDGE_ARRAY_TOPIC) != RELATIVE_ROTATION_ARRAY:
-            bag.require(EDGE_TOPIC, RELATIVE_ROTATION)
+            _require(bag, EDGE_TOPIC, RELATIVE_ROTATION)
         content = _read(bag)
         if content.left_out and not content.edges:
             raise BagReadError(f"{path}: {content.edge_topics}: no edge can be used; {_listed(content.left_out)}")
         if not content.by_id:
-            bag.require(ODOM_TOPIC, ODOMETRY)
+            _require(bag, ODOM_TOPIC, ODOMETRY)
             if not any(map(is_sound, content.odometry)):
                 raise BagReadError(f"{path}: {ODOM_TOPIC} has no messages with a pose, so there are no keyframes")
             check_time(path, content.odometry)
@@ -116,6 +117,18 @@ def read_graph_bag(path: str | Path) -> GraphFile:
     if graph_file.graph.num_edges == 0:
         raise BagReadError(f"{path}: {content.edge_topics}: no edge joins two keyframes; there is no graph")
     return _with_truth(replace(graph_file, damage=damage, warnings=content.warnings), content)
+
+
+def _require(bag: BagReader, topic: str, message_type: str) -> None:
+    """Refuse a bag without that topic; where a replay has a use for others, with what to do."""
+    try:
+        bag.require(topic, message_type)
+    except BagReadError as error:
+        others = [name for name, kind in bag.topics.items() if kind in EDGE_CONVERTERS]
+        if not others:
+            raise
+        replays = f"`rotavg replay` takes {', '.join(others)} and odometry of any name, and writes a graph.g2o"
+        raise BagReadError(f"{error}; {replays}") from None
 
 
 def _read(bag: BagReader) -> _Content:

@@ -285,6 +285,16 @@ def test_what_makes_no_graph_is_refused(tmp_path: Path, edges: list[Edge], compl
     assert "\n" not in str(caught.value)
 
 
+def test_what_a_replay_has_a_use_for_is_told(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/loops", RELATIVE_ROTATION)
+        bag.write("/loops", 1, edge_message(edge(0, Keyframe(1, 0), Keyframe(2, 0))))
+    with pytest.raises(
+        BagReadError, match=r"no topic /relative_rotations .*; `rotavg replay` takes /loops and odometry"
+    ):
+        read_graph_bag(tmp_path / "bag")
+
+
 @pytest.mark.parametrize("by_stamp", [False, True])
 @pytest.mark.parametrize("in_array", [False, True])
 def test_edges_that_the_estimator_refuses_are_skipped_and_counted(
