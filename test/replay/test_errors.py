@@ -271,7 +271,7 @@ def test_a_reference_that_loses_its_position_now_and_then(tmp_path: Path) -> Non
         ("", "the file has no rows"),
         ("900.0 0 0 0 0 0 0 1\n901.0 0 0 0 0 0 0 1\n", "do not overlap the bag's"),
         ("1.5 0 0 0 0 0 0 9\n", "a quaternion of length 9"),
-        ("2.0 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n", ":2: a stamp that is not after the one before"),
+        ("2.0 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n", ":2: a stamp earlier than the one before"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "3 poses without stamps, but 50 odometry messages"),
     ],
 )

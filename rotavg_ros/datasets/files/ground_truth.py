@@ -134,7 +134,11 @@ def nanoseconds(path: Path, line: int, seconds: bytes) -> int:
 
 def whole_nanoseconds(path: Path, line: int, stamp: bytes) -> int:
     """A stamp given in nanoseconds, as in EuRoC's files."""
-    value = int(stamp) if stamp.removeprefix(b"-").isdigit() else round(float(stamp))
+    is_whole = stamp.removeprefix(b"-").isdigit()
+    if not is_whole and not float(stamp).is_integer():
+        what = f"stamp {shown(stamp)} is not a whole number; EuRoC's stamps are in nanoseconds, TUM's in seconds"
+        raise GraphFileError.at(path, line, what)
+    value = int(stamp) if is_whole else int(float(stamp))
     return _in_range(path, line, value, f"stamp {shown(stamp)} is too large; EuRoC's stamps are in nanoseconds")
 
 

@@ -111,8 +111,9 @@ def _by_stamp(path: Path, lines: list[int], cells: list[Row], *, in_ns: bool = F
     else:
         stamps = [nanoseconds(path, line, row[0]) for line, row in zip(lines, cells, strict=True)]
     stamps_ns = np.array(stamps, dtype=np.int64)
-    backward = np.concatenate(([False], np.diff(stamps_ns) <= 0))
-    refuse(path, lines, backward, "a stamp that is not after the one before; sort the rows by time")
+    step = np.diff(stamps_ns, prepend=stamps_ns[0] - 1)
+    refuse(path, lines, step < 0, "a stamp earlier than the one before; sort the rows by time")
+    refuse(path, lines, step == 0, "the same stamp as the one before; remove one of the two rows")
     return stamps_ns, numbers[:, 1:]
 
 

@@ -129,7 +129,9 @@ def test_headings_in_the_plane(tmp_path: Path) -> None:
         ("-1x,0,0,0\n2,0,0,0\n", ":1: '-1x' is not a number"),
         ("1,0,0,0,1,0,0,0\n" + "9" * 20 + ",0,0,0,1,0,0,0\n", ":2: stamp '99999999999999999999' is too large"),
         ("1,0,0,0,1,0,0,0\n1e30,0,0,0,1,0,0,0\n", ":2: stamp '1e30' is too large; EuRoC's stamps are in nanoseconds"),
-        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", ":2: a stamp that is not after the one before"),
+        ("2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", ":2: a stamp earlier than the one before; sort"),
+        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", ":2: the same stamp as the one before; remove one"),
+        ("1,0,0,0,0,0,0,1\n2.5,0,0,0,0,0,0,1\n", ":2: stamp '2.5' is not a whole number; EuRoC's stamps are in nano"),
         ("2 0 0 0 0 1 0 0 0 0 1 0\n", ":1: a matrix that is not a rotation"),
     ],
 )
