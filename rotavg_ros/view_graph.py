@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
@@ -374,6 +375,10 @@ def _num_nodes(source: Tensor, target: Tensor, given: int | None) -> int:
     """Number of nodes in a graph of these edges; refuses ends beyond them."""
     smallest, largest = torch.minimum(source, target), torch.maximum(source, target)
     _refuse(smallest < 0, "node {}; node indices count from 0", smallest)
+    try:
+        given = None if given is None else operator.index(given)  # such as NumPy's, or a tensor's
+    except TypeError:
+        raise ViewGraphError(f"num_nodes is {given!r}; it must be a whole number") from None
     if given is not None and not 0 <= given <= _MAX_NODES:
         raise ViewGraphError(f"num_nodes is {given}; it must be 0 … {_MAX_NODES}")
     if given is not None:

@@ -98,6 +98,8 @@ def test_refuses_what_makes_no_graph(source: Any, target: Any, quaternion: Any, 
         ({"steps": [1e-300]}, "edge 0 has 1e-300 steps"),
         ({"steps": [np.nan]}, "edge 0 has nan steps"),
         ({"num_nodes": -1}, "num_nodes is -1"),
+        ({"num_nodes": 3.0}, "num_nodes is 3.0; it must be a whole number"),
+        ({"num_nodes": "3"}, "num_nodes is '3'; it must be a whole number"),
         ({"num_nodes": 2**31}, "num_nodes is 2147483648; it must be 0 … 2147483647"),
     ],
 )
@@ -113,6 +115,8 @@ def test_ids_are_no_indices() -> None:
             ViewGraph.create([0], [largest], [_UNIT])
     # What is said to be meant is meant, and gaps of a thousand are nothing.
     assert ViewGraph.create([0], [10**6], [_UNIT], num_nodes=10**6 + 1).num_nodes == 10**6 + 1
+    for whole in (np.int32(3), torch.tensor(3)):
+        assert type(ViewGraph.create([0], [1], [_UNIT], num_nodes=whole).num_nodes) is int
     assert ViewGraph.create([3], [1000], [_UNIT]).num_nodes == 1001
 
 
