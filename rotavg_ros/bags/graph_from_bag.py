@@ -176,7 +176,8 @@ def _check(path: str | Path, content: _Content) -> None:
     robots = sorted({end.robot for end in ends})
     if len(robots) > 1:
         names = ", ".join(repr(robot) for robot in robots)
-        raise BagReadError(f"{path}: edges of several robots ({names}); a graph has room for one")
+        told = "a graph has room for one; `rotavg replay` reads the bag, and writes a graph.g2o of all"
+        raise BagReadError(f"{path}: edges of several robots ({names}), and {told}")
     if content.by_id and (largest := max(end.id or 0 for end in ends)) > MAX_NODE_ID:
         raise BagReadError(f"{path}: keyframe id {largest} is too large; the largest possible is {MAX_NODE_ID}")
 

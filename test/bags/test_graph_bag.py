@@ -264,7 +264,7 @@ def test_a_stamp_that_is_not_stated_is_none(tmp_path: Path, first: int, again: i
 @pytest.mark.parametrize(
     ("edges", "complaint"),
     [
-        ([edge(0, Keyframe(1, 0, "a"), Keyframe(2, 0, "b"))], "several robots"),
+        ([edge(0, Keyframe(1, 0, "a"), Keyframe(2, 0, "b"))], "several robots .* `rotavg replay` reads"),
         ([edge(0, Keyframe(1, 0), Keyframe(2**63, 0))], "too large"),
         ([edge(0, Keyframe(1, 0), Keyframe(2, 0), (0, 0, 0, 0.5))], "no edge can be used; 1 × edges whose rotation"),
         ([edge(0, Keyframe(1, 0), Keyframe(2, 0), (0, 0, 0, np.nan))], "no edge can be used; 1 × edges whose rotation"),
