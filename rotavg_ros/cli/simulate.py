@@ -50,6 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _check_graph(arguments: argparse.Namespace) -> None:
     with asking_about(arguments.graph, BagWriteError):
         exists = arguments.graph.exists()
+    if real(arguments.output) == real(arguments.graph):
+        raise BagWriteError(f"{arguments.graph}: is the bag's place as well; choose another --graph")
     if real(arguments.output) in real(arguments.graph).parents:
         raise BagWriteError(f"{arguments.graph}: is in the bag, which is written after it; choose another --graph")
     if exists and not arguments.overwrite:

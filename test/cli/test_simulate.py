@@ -101,6 +101,13 @@ def test_a_graph_is_not_replaced_by_its_bag(tmp_path: Path, capsys: pytest.Captu
     assert said == f"rotavg: error: {graph}: is in the bag, which is written after it; choose another --graph\n"
 
 
+def test_a_graph_and_a_bag_need_places_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    place = tmp_path / "run.g2o"
+    assert main(["simulate", "--output", str(place), "--graph", str(place)]) == 2
+    assert f"{place}: is the bag's place as well; choose another --graph" in capsys.readouterr().err
+    assert not place.exists()
+
+
 def test_an_existing_graph_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     graph = tmp_path / "graph.g2o"
     graph.write_text("mine")
