@@ -64,7 +64,7 @@ def test_refusals(graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     for words, message in (
         (["missing.g2o", "x.npz"], "missing.g2o: no such file"),
         ([str(graph_path), str(tmp_path / "x.foo")], "unknown suffix '.foo'"),
-        ([str(graph_path), str(tmp_path / "none" / "x.npz")], "cannot be written: No such file or directory"),
+        ([str(graph_path), str(tmp_path / "none" / "x.npz")], f"there is no folder {tmp_path / 'none'}; make it"),
         ([str(graph_path), str(graph_path / "x.npz")], "cannot be written: Not a directory"),
         ([str(graph_path), str(tmp_path / "folder.npz" / ".." / "graph.g2o"), "--overwrite"], "is the INPUT itself"),
         ([str(graph_path), str(tmp_path / "folder.npz"), "--overwrite"], "folder.npz: is a folder"),

@@ -21,7 +21,7 @@ import torch
 from rotavg_ros.errors import UserError
 from rotavg_ros.packed import HEAD, how_to_unpack
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph, where_possible
-from rotavg_ros.whole_file import replacing
+from rotavg_ros.whole_file import real, replacing
 
 # Ids are non-negative so that they fit the unsigned 64-bit ids of the messages and of gtsam's keys.
 MAX_NODE_ID = np.iinfo(np.int64).max
@@ -239,4 +239,7 @@ def writing(path: Path) -> Iterator[Path]:
         with replacing(path) as temporary:
             yield temporary
     except OSError as error:
-        raise GraphFileError.at(path, None, f"cannot be written: {error.strerror or error}") from None
+        what = f"cannot be written: {error.strerror or error}"
+        if isinstance(error, FileNotFoundError) and not (folder := real(path).parent).exists():
+            what = f"cannot be written: there is no folder {folder}; make it first"
+        raise GraphFileError.at(path, None, what) from None
