@@ -204,7 +204,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "moves": {"densities", "em", "labels", "left_out", "mode", "objective", "priors", "problem", "rows", "state"},
         "inference": {"em", "mode", "moves", "problem", "rows", "state"},
         "publishing": {"em", "left_out", "mode", "problem", "rows", "state", "system"},
-        "solve": {"calibration", "inference", "mode", "moves", "priors", "problem", "state"},
+        "solve": {"calibration", "em", "inference", "mode", "moves", "priors", "problem", "state"},
     },
     "online": {
         "free_memory": set(),

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.odometry_lengths import ways_passed
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.running.work import spend
@@ -19,7 +20,9 @@ from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.calibration import PARTS, Calibration, calibrated
 from rotavg_ros.solver.slam.noise.mounting import ALIKE, between_axes, estimate_mountings, is_about_as_said, may_be_told
 from rotavg_ros.solver.slam.noise.turns import squared_turns
+from rotavg_ros.solver.slam.noise.vertical import Vertical
 from rotavg_ros.solver.slam.posterior.calibration import Calibrated
+from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.inference import Search
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
@@ -31,6 +34,8 @@ from rotavg_ros.view_graph import ViewGraph
 
 # Maximum number of rounds that improve a part of the calibration, and the least decrease of F, nats, for another round.
 _ROUNDS, _LEAST_GAIN = 8, 0.5
+# A step on the bias tells of one if residuals gain this many nats, two standard deviations.
+_TELLS = 2.0
 # A mounting that lowers F by this many nats is reported.
 _SUSPICIOUS = 5.0
 # Units of work per edge to prepare a problem.
@@ -156,6 +161,7 @@ def search(
         found = solver.with_parts(as_said, {part: each for part, each in likely.items() if part != "mounting"})
         if mounted.cost < found.cost - _SUSPICIOUS and np.linalg.norm(mounted.mounting) > ALIKE:
             suspected = mounted.mounting
+    found = solver.about_vertical(found)
     left = calibrated(graph, found.calibration)
     if left.rotation_components < graph.rotation_components:
         # After the correction all rotations, and so their errors, are about one axis.
@@ -164,9 +170,16 @@ def search(
 
 
 class _Predicted(NamedTuple):
-    """Change of F, nats, that a Newton step predicts for another calibration."""
+    """What a Newton step promises.
+
+    Attributes:
+        cost: change of F, nats, with noise and labels as they are.
+        gain: nats of it that are due to residuals.
+        calibration: after the step.
+    """
 
     cost: float
+    gain: float
     calibration: Calibration
 
 
@@ -226,30 +239,104 @@ class _Solver(NamedTuple):
             found = better
         return found
 
-    def predicted(self, found: Found, part: str) -> _Predicted:
-        """A Newton step from the best mode, on the parts already calibrated and one more."""
-        best, before = found.modes[0], found.calibration or Calibration.none()
-        problem, evaluation = best.problem, best.evaluation
+    def predicted(
+        self, found: Found, part: str, origin: Mode | None = None, axis: np.ndarray | None = None
+    ) -> _Predicted:
+        """A Newton step from a mode, by default the best, on the parts already calibrated and one more.
+
+        Args:
+            found: with its calibration.
+            part: the one more.
+            origin: the mode.
+            axis: ``(3,)`` along which alone the bias changes, and nothing else does; default: everything may.
+        """
+        mode, before = origin or found.modes[0], found.calibration or Calibration.none()
+        problem, evaluation = mode.problem, mode.evaluation
         prepared, parts = found.drawn.prepared, {part, *before.parts}
         tried = Calibrated.of(before.taken_out_of(self.graph), prepared, before, parts)
         information, change = tried.information(
-            problem.graph.source, best.state, evaluation.residual, evaluation.factorised, problem.priors
+            problem.graph.source, mode.state, evaluation.residual, evaluation.factorised, problem.priors
         )
+        if axis is not None:
+            along = tried.axes[:, :3] @ axis
+            change = along * (along @ information @ change) / (along @ information @ along)
         cost = tried.cost(information, problem.priors) - evaluation.terms.get("calibration", 0.0)
-        return _Predicted(cost - float(change @ information @ change) / 2, before.moved(change @ tried.axes))
+        gain = float(change @ information @ change) / 2
+        return _Predicted(cost - gain, gain, before.moved(change @ tried.axes))
 
     def _better(self, found: Found, part: str) -> Found | None:
-        """Result of a search from the best mode after that step, if F falls."""
-        cost, calibration = self.predicted(found, part)
-        if cost > -_LEAST_GAIN or (part == "mounting" and np.linalg.norm(calibration.mounting) < ALIKE):
+        """Result of a search from the best mode after that step, if F falls; a bias may also start otherwise.
+
+        Noise, slips and tilts may stand for what a bias does. So where a step tells of one, F decides with noise of its
+        own, if need be from the best mode without its slips, or about the body's vertical alone.
+        """
+        best = found.modes[0]
+        starts: list[tuple[Mode, np.ndarray | None]] = [(best, None)]
+        if part == "bias":
+            origins, vertical = ([best, _mended(best)] if len(best.slipped) else [best]), self._body_vertical(found)
+            starts = [
+                (origin, axis) for origin in origins for axis in (None, *([] if vertical is None else [vertical]))
+            ]
+        for origin, axis in starts:
+            step = self.predicted(found, part, origin, axis)
+            is_promised = step.cost < -_LEAST_GAIN and axis is None
+            if part == "mounting" and np.linalg.norm(step.calibration.mounting) < ALIKE:
+                continue
+            if not is_promised and (part != "bias" or step.gain < _TELLS):
+                continue
+            most = np.inf if is_promised and origin is best else found.cost
+            better = self._from_mode(origin, found.drawn, step.calibration, most)
+            if better.cost < found.cost - _LEAST_GAIN:
+                return better
+        return None
+
+    def about_vertical(self, found: Found) -> Found:
+        """Result with only that part of a bias that is about the body's vertical, if F falls, tilts included.
+
+        On a robot that stays upright closures tell little of the other parts, and these tilt the map.
+        """
+        before, axis = found.calibration, self._body_vertical(found)
+        if before is None or not before.bias.any() or axis is None:
+            return found
+        upright = self._from_mode(found.modes[0], found.drawn, replace(before, bias=axis * (axis @ before.bias)))
+        for _ in range(_ROUNDS):
+            step = self.predicted(upright, "bias", axis=axis)
+            if step.cost > -_LEAST_GAIN:
+                break
+            better = self._from_mode(upright.modes[0], upright.drawn, step.calibration)
+            if better.cost > upright.cost - _LEAST_GAIN:
+                break
+            upright = better
+        return min(found, upright, key=lambda either: either.cost + self._log_tilts(either))
+
+    def _body_vertical(self, found: Found) -> np.ndarray | None:
+        """``(3,)`` the vertical in the body of a robot that stays upright but leaves the plane; None for others."""
+        problem = found.drawn.problem
+        if problem.vertical is None or problem.components == 1:
             return None
-        best, drawn = found.modes[0], found.drawn
+        orientations = rotations.to_matrix(found.drawn.orientations(found.modes[0].state)).numpy()
+        axis = (orientations @ problem.vertical.axis).mean(axis=0)
+        return np.asarray(axis / np.linalg.norm(axis))
+
+    def _log_tilts(self, found: Found) -> float:
+        """Nats, −log density of the body's tilts, N(0, τ²) in two components, τ unknown: once for each full turn."""
+        vertical = Vertical.of(found.drawn.orientations(found.modes[0].state))
+        if vertical is None:
+            return np.inf
+        odometry, variance = self.graph.is_odometry, found.drawn.prepared.noise.step_variance
+        square = (rotations.log(self.graph.target_from_source[odometry]) ** 2).sum(dim=1)
+        # What noise alone would turn does not count.
+        turned = (square - 3 * variance * self.graph.steps[odometry]).clamp_min(0.0).sqrt().sum()
+        return float(turned / (2 * np.pi) * np.log(vertical.variance))
+
+    def _from_mode(self, origin: Mode, drawn: Drawn, calibration: Calibration, most: float = np.inf) -> Found:
+        """Result of a search from a mode with another calibration; not gone on with where F is more than ``most``."""
         again = self._drawn(calibration)
         goes_on = Search(again.problem)
-        goes_on.keep(goes_on.flipped(goes_on.polished(_moved(best, drawn, again), "calibration")))
-        goes_on.move_on()
-        better = Found(again, goes_on.modes)
-        return better if better.cost < found.cost - _LEAST_GAIN else None
+        goes_on.keep(goes_on.flipped(goes_on.polished(_moved(origin, drawn, again), "calibration")))
+        if goes_on.modes[0].cost < most:
+            goes_on.move_on()
+        return Found(again, goes_on.modes)
 
     def _drawn(self, calibration: Calibration | None, components: int | None = None) -> Drawn:
         """The graph contracted with a calibration. F is compared with that without one, so k is kept by default."""
@@ -283,6 +370,13 @@ def _from_root(of_edge: Tensor, prepared: Prepared) -> np.ndarray:
     """``(N,)`` sums of the edges' values ``(M,)`` along the forest, from each node's root."""
     parent_edge = prepared.forest.parent_edge
     return accumulate_to_root(prepared.forest, np.where(parent_edge >= 0, of_edge.double().numpy()[parent_edge], 0.0))
+
+
+def _mended(mode: Mode) -> Mode:
+    """The same labels, but that no odometry slipped."""
+    trusted = mode.state.trusted.copy()
+    trusted[mode.slipped] = 1.0
+    return Mode(mode.problem, *polish(mode.problem, replace(mode.state, trusted=trusted)), mode.origin)
 
 
 def _moved(mode: Mode, before: Drawn, after: Drawn) -> State:
