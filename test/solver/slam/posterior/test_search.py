@@ -446,12 +446,15 @@ def test_no_mode_that_the_search_ends_with_is_bettered_by_its_own_settling() -> 
     assert settled.cost > best.cost - 1.0
 
 
-@pytest.mark.parametrize("bias", [0.01, 0.05])
-def test_right_closures_that_all_contradict_odometry_by_the_same_turn(bias: float) -> None:
-    """A gyroscope's scale is off and nothing else errs: laps of 60 keyframes, closures from each to the next."""
-    count, lap = 300, 60
+@pytest.mark.parametrize(("bias", "laps", "every"), [(0.01, 5, 5), (0.05, 5, 5), (0.01, 2, 1)])
+def test_right_closures_that_all_contradict_odometry_by_the_same_turn(bias: float, laps: int, every: int) -> None:
+    """A gyroscope's scale is off and nothing else errs: laps of 60 keyframes, closures from each to the next.
+
+    Of two laps all closures span the step between them, and a slip there explains them as well.
+    """
+    lap, count = 60, 60 * laps
     turn = 2 * np.pi / lap
-    closed = np.arange(lap, count, 5)
+    closed = np.arange(lap, count, every)
     source = np.concatenate((np.arange(count - 1), closed - lap))
     target = np.concatenate((np.arange(1, count), closed))
     angle = np.concatenate((np.full(count - 1, turn * (1 + bias)), np.full(len(closed), turn * lap)))
