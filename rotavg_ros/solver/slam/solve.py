@@ -22,7 +22,7 @@ from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.calibration import calibrated
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.poses.search.jumps import jump_warnings
-from rotavg_ros.solver.slam.poses.solve import has_places, median_poses
+from rotavg_ros.solver.slam.poses.solve import Median, has_places, median_poses
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.publishing.modes import publish
 from rotavg_ros.solver.slam.posterior.publishing.notes import notes_of
@@ -95,20 +95,26 @@ def _whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     with run.watch.stage("refine"):
         found = search(graph, _clean_net(stages, run), partial(_begin, stages, run), stages.without)
         tune = _tuning(stages, run)
-        published = publish(found.drawn.problem, found.modes, tune)
-    with run.watch.stage("expand"):
-        estimate, mode, poses = estimate_of(published), found.modes[published.chosen], None
+    poses: Median | None = None
     if "translations" not in stages.without and has_places(graph):
         with run.watch.stage("poses"):
-            poses, mode = median_poses(calibrated(graph, found.calibration), found.modes, tune)
+            poses = median_poses(calibrated(graph, found.calibration), found.modes, tune)
+            if found.otherwise is not None:
+                # Translations may tell of a bias where rotations hardly do.
+                other = median_poses(calibrated(graph, found.otherwise.calibration), found.otherwise.modes, tune)
+                if other.cost + found.otherwise.tilts < poses.cost + found.tilts:
+                    found, poses = replace(found.otherwise, suspected=found.suspected), other
+    with run.watch.stage("expand"):
+        published = publish(found.drawn.problem, found.modes, tune)
+        estimate, mode = estimate_of(published), found.modes[published.chosen] if poses is None else poses.mode
     # The posterior's warning is about rivals by rotations alone; translations may have decided between them.
-    told = estimate.warnings if poses is None else poses.poses.warnings
-    jumps = () if poses is None else jump_warnings(poses.pose)
+    told = estimate.warnings if poses is None else poses.memory.poses.warnings
+    jumps = () if poses is None else jump_warnings(poses.memory.pose)
     estimate = replace(estimate, warnings=(*told, *notes_of(mode, found.suspected), *jumps))
     if stages == SlamStages():
         memory = SlamMemory.of(graph, found.calibration, mode, estimate, bool(told))
         estimate = replace(estimate, memory=memory)
-    return estimate if poses is None else with_poses(graph, estimate, poses)
+    return estimate if poses is None else with_poses(graph, estimate, poses.memory)
 
 
 def _clean_net(stages: SlamStages, run: Run) -> SlamCleanNet | None:

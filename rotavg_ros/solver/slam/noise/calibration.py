@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -23,10 +23,12 @@ class Calibration:
     Attributes:
         bias: ``(3,)`` rad per step by which odometry turns too far, in the body's frame.
         mounting: ``(3,)`` rad, deviation of the closures' sensor from its stated mounting, in the body's frame.
+        axis: ``(3,)`` unit vector of the body, about which alone the bias may be; None: about any.
     """
 
     bias: np.ndarray
     mounting: np.ndarray
+    axis: np.ndarray | None = None
 
     @classmethod
     def of(cls, vector: np.ndarray) -> Calibration:
@@ -51,7 +53,7 @@ class Calibration:
     def moved(self, change: np.ndarray) -> Calibration:
         """The calibration plus ``(6,)``, rad per step and rad, that remains after it was removed."""
         both = (rotations.exp(torch.from_numpy(turn)[None]) for turn in (self.mounting, change[3:]))
-        return Calibration(self.bias + change[:3], rotations.log(rotations.multiply(*both))[0].numpy())
+        return replace(self, bias=self.bias + change[:3], mounting=rotations.log(rotations.multiply(*both))[0].numpy())
 
     def taken_out_of(self, graph: ViewGraph) -> ViewGraph:
         """The graph as it would have been measured without these errors."""

@@ -17,7 +17,7 @@ from rotavg_ros.solver.algebra import quaternion_rows
 
 # A robot is upright if the standard deviation of its tilt, per component, is at most the first, rad, and if it turns so
 # far about the vertical that the mean of no other direction of the world in its body is longer than the second.
-_MOST_TILT, _TURNS = np.radians(15.0), 0.8
+MOST_TILT, _TURNS = np.radians(15.0), 0.8
 # An axis is nearly vertical within the first, rad. Odometry errs mostly about one axis if its variance is more than the
 # second number times that of the next one.
 _NEARLY_VERTICAL, _STANDS_OUT = np.radians(20.0), 2.0
@@ -50,7 +50,7 @@ class Vertical:
         mean = rotations.to_matrix(body_from_world).mean(dim=0).double()
         _, length, directions = torch.linalg.svd(mean)
         variance = max(1 - float(length[0]), 0.0)
-        if variance > _MOST_TILT**2 or float(length[1]) > _TURNS:
+        if variance > MOST_TILT**2 or float(length[1]) > _TURNS:
             return None
         return cls(directions[0].numpy(), max(variance, _LEAST_TILT**2))
 

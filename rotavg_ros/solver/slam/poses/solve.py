@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -50,10 +51,22 @@ def _is_resolved(graph: ViewGraph, chain: np.ndarray) -> bool:
     return bool(way.max() < farthest * typical_length(way, steps, np.ones(len(way), dtype=bool)))
 
 
-def median_poses(
-    graph: ViewGraph, modes: list[Mode], tuned: Callable[[Mode], Mode] = lambda mode: mode
-) -> tuple[PoseMemory, Mode]:
+class Median(NamedTuple):
     """Poses and their labelling, the median of those that rotations and translations make likely.
+
+    Attributes:
+        memory: the poses.
+        mode: the labelling.
+        cost: −log p of the likeliest labelling, nats; NaN where there are no closures to decide by.
+    """
+
+    memory: PoseMemory
+    mode: Mode
+    cost: float
+
+
+def median_poses(graph: ViewGraph, modes: list[Mode], tuned: Callable[[Mode], Mode] = lambda mode: mode) -> Median:
+    """The median of the poses that rotations and translations make likely.
 
     Args:
         graph: calibrated, with translations.
@@ -61,10 +74,10 @@ def median_poses(
         tuned: function that sets each edge's noise in a labelling by FineNet.
     """
     if len(modes[0].problem.closure) == 0:
-        return poses_of_labels(graph, tuned(modes[0])), modes[0]
+        return Median(poses_of_labels(graph, tuned(modes[0])), modes[0], np.nan)
     rivals = rival_poses(graph, _translations(graph), modes, tuned)
     poses, middle = answer(rivals.poses, rivals.share)
-    return PoseMemory.of(rivals.poses[middle], poses), rivals.modes[middle]
+    return Median(PoseMemory.of(rivals.poses[middle], poses), rivals.modes[middle], rivals.cost)
 
 
 def poses_of_update(graph: ViewGraph, mode: Mode, memory: PoseMemory) -> PoseMemory | None:

@@ -53,7 +53,7 @@ class Calibrated:
         nothing = np.zeros((0, 6)), np.zeros((len(prepared.closure_graph.source), 3, 0))
         found = [nothing]
         if "bias" in parts:
-            found.append(_of_bias(graph, prepared, is_planar))
+            found.append(_of_bias(graph, prepared, is_planar, calibration.axis))
         if "mounting" in parts and not is_planar:
             found.append(_of_mounting(graph, prepared))
         axes, design = (
@@ -106,13 +106,17 @@ class Calibrated:
         return float((precision * self.value**2).sum() / 2 + occam + either)
 
 
-def _of_bias(graph: ViewGraph, prepared: Prepared, is_planar: bool) -> tuple[np.ndarray, np.ndarray]:
+def _of_bias(
+    graph: ViewGraph, prepared: Prepared, is_planar: bool, axis: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
     """Axes ``(d, 6)`` and design ``(E, 3, d)``."""
     closure_graph = prepared.closure_graph
     axes = np.eye(3)
     if is_planar:
         turns = rotations.log(graph.target_from_source)
         axes = torch.linalg.eigh(turns.T @ turns)[1][:, -1:].numpy().T
+    elif axis is not None:
+        axes = axis[None]
     drift = drift_per_bias(graph, prepared.forest, closure_graph)[closure_graph.nodes] @ axes.T
     design = np.zeros((len(closure_graph.source), 3, len(axes)))
     segments = np.arange(closure_graph.num_segments)

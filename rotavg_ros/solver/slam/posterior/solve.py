@@ -20,7 +20,7 @@ from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.calibration import PARTS, Calibration, calibrated
 from rotavg_ros.solver.slam.noise.mounting import ALIKE, between_axes, estimate_mountings, is_about_as_said, may_be_told
 from rotavg_ros.solver.slam.noise.turns import squared_turns
-from rotavg_ros.solver.slam.noise.vertical import Vertical
+from rotavg_ros.solver.slam.noise.vertical import MOST_TILT, Vertical
 from rotavg_ros.solver.slam.posterior.calibration import Calibrated
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.inference import Search
@@ -36,6 +36,8 @@ from rotavg_ros.view_graph import ViewGraph
 _ROUNDS, _LEAST_GAIN = 8, 0.5
 # A step on the bias tells of one if residuals gain this many nats, two standard deviations.
 _TELLS = 2.0
+# A labelling with or without a bias is left to translations if F is higher by less than this, nats.
+_HARDLY = 5.0
 # A mounting that lowers F by this many nats is reported.
 _SUSPICIOUS = 5.0
 # Units of work per edge to prepare a problem.
@@ -102,11 +104,15 @@ class Found:
         drawn: the contracted graph, after the calibration was removed, if any.
         modes: its modes, in order of increasing F.
         suspected: ``(3,)`` rad, apparent rotation between the axes of closures and odometry, if either may be wrong.
+        tilts: nats, −log density of the answer's tilts, by which answers with and without a bias are compared.
+        otherwise: what was found without a bias, or with one, where this has one, or none, and is hardly likelier.
     """
 
     drawn: Drawn
     modes: list[Mode]
     suspected: np.ndarray | None = None
+    tilts: float = 0.0
+    otherwise: Found | None = None
 
     @property
     def cost(self) -> float:
@@ -114,10 +120,20 @@ class Found:
         return self.modes[0].cost
 
     @property
+    def total(self) -> float:
+        """F of the best mode, and tilts, nats."""
+        return self.cost + self.tilts
+
+    @property
     def calibration(self) -> Calibration | None:
         """The calibration that was removed from the measurements, if any."""
         taken_out = self.drawn.problem.calibrated
         return None if taken_out is None else taken_out.calibration
+
+    @property
+    def is_biased(self) -> bool:
+        """Whether a gyroscope's bias was removed."""
+        return self.calibration is not None and bool(self.calibration.bias.any())
 
     @property
     def mounting(self) -> np.ndarray:
@@ -151,7 +167,7 @@ def search(
         without: terms and moves that are switched off.
         priors: default: the usual ones.
     """
-    solver = _Solver(graph, network, begin, without, priors)
+    solver = _Solver(graph, network, begin, without, priors, [])
     as_said = solver.from_starts(None)
     likely = {part: solver.likely(as_said, part) for part in PARTS if part not in without}
     found, suspected = solver.with_parts(as_said, likely), None
@@ -166,7 +182,10 @@ def search(
     if left.rotation_components < graph.rotation_components:
         # After the correction all rotations, and so their errors, are about one axis.
         found = solver.from_starts(found.calibration, left.rotation_components)
-    return replace(found, suspected=suspected)
+        return replace(found, suspected=suspected)
+    found, *others = (replace(each, tilts=solver.tilts(each)) for each in (found, as_said, *solver.tried))
+    near = [each for each in others if each.is_biased != found.is_biased and each.total < found.total + _HARDLY]
+    return replace(found, suspected=suspected, otherwise=min(near, key=attrgetter("total"), default=None))
 
 
 class _Predicted(NamedTuple):
@@ -184,13 +203,14 @@ class _Predicted(NamedTuple):
 
 
 class _Solver(NamedTuple):
-    """The arguments of :func:`search`."""
+    """The arguments of :func:`search`, and what was found with other calibrations on the way."""
 
     graph: ViewGraph
     network: SlamCleanNet | None
     begin: Begin
     without: Collection[str]
     priors: SlamPriors | None
+    tried: list[Found]
 
     def from_starts(self, calibration: Calibration | None, components: int | None = None) -> Found:
         """Result from all starts after a calibration is removed; by default k is that of the graph."""
@@ -248,18 +268,16 @@ class _Solver(NamedTuple):
             found: with its calibration.
             part: the one more.
             origin: the mode.
-            axis: ``(3,)`` along which alone the bias changes, and nothing else does; default: everything may.
+            axis: ``(3,)`` about which alone a bias is to be, where there is none yet; default: about any.
         """
         mode, before = origin or found.modes[0], found.calibration or Calibration.none()
+        before = before if axis is None else replace(before, axis=axis)
         problem, evaluation = mode.problem, mode.evaluation
         prepared, parts = found.drawn.prepared, {part, *before.parts}
         tried = Calibrated.of(before.taken_out_of(self.graph), prepared, before, parts)
         information, change = tried.information(
             problem.graph.source, mode.state, evaluation.residual, evaluation.factorised, problem.priors
         )
-        if axis is not None:
-            along = tried.axes[:, :3] @ axis
-            change = along * (along @ information @ change) / (along @ information @ along)
         cost = tried.cost(information, problem.priors) - evaluation.terms.get("calibration", 0.0)
         gain = float(change @ information @ change) / 2
         return _Predicted(cost - gain, gain, before.moved(change @ tried.axes))
@@ -273,10 +291,9 @@ class _Solver(NamedTuple):
         best = found.modes[0]
         starts: list[tuple[Mode, np.ndarray | None]] = [(best, None)]
         if part == "bias":
-            origins, vertical = ([best, _mended(best)] if len(best.slipped) else [best]), self._body_vertical(found)
-            starts = [
-                (origin, axis) for origin in origins for axis in (None, *([] if vertical is None else [vertical]))
-            ]
+            vertical = None if found.is_biased else self._body_vertical(found)
+            axes = (None,) if vertical is None else (None, vertical)
+            starts = [(origin, axis) for origin in (best, *_mended(best)) for axis in axes]
         for origin, axis in starts:
             step = self.predicted(found, part, origin, axis)
             is_promised = step.cost < -_LEAST_GAIN and axis is None
@@ -286,7 +303,11 @@ class _Solver(NamedTuple):
                 continue
             most = np.inf if is_promised and origin is best else found.cost
             better = self._from_mode(origin, found.drawn, step.calibration, most)
-            if better.cost < found.cost - _LEAST_GAIN:
+            self.tried.append(better)
+            gain = found.cost - better.cost
+            if part == "bias" and found.drawn.problem.components > 1:
+                gain += self.tilts(found) - self.tilts(better)
+            if gain > _LEAST_GAIN:
                 return better
         return None
 
@@ -296,18 +317,11 @@ class _Solver(NamedTuple):
         On a robot that stays upright closures tell little of the other parts, and these tilt the map.
         """
         before, axis = found.calibration, self._body_vertical(found)
-        if before is None or not before.bias.any() or axis is None:
+        if before is None or not before.bias.any() or before.axis is not None or axis is None:
             return found
-        upright = self._from_mode(found.modes[0], found.drawn, replace(before, bias=axis * (axis @ before.bias)))
-        for _ in range(_ROUNDS):
-            step = self.predicted(upright, "bias", axis=axis)
-            if step.cost > -_LEAST_GAIN:
-                break
-            better = self._from_mode(upright.modes[0], upright.drawn, step.calibration)
-            if better.cost > upright.cost - _LEAST_GAIN:
-                break
-            upright = better
-        return min(found, upright, key=lambda either: either.cost + self._log_tilts(either))
+        upright = replace(before, bias=axis * (axis @ before.bias), axis=axis)
+        other = self.with_part(self._from_mode(found.modes[0], found.drawn, upright), "bias")
+        return min(found, other, key=lambda either: either.cost + self.tilts(either))
 
     def _body_vertical(self, found: Found) -> np.ndarray | None:
         """``(3,)`` the vertical in the body of a robot that stays upright but leaves the plane; None for others."""
@@ -318,16 +332,14 @@ class _Solver(NamedTuple):
         axis = (orientations @ problem.vertical.axis).mean(axis=0)
         return np.asarray(axis / np.linalg.norm(axis))
 
-    def _log_tilts(self, found: Found) -> float:
+    def tilts(self, found: Found) -> float:
         """Nats, −log density of the body's tilts, N(0, τ²) in two components, τ unknown: once for each full turn."""
         vertical = Vertical.of(found.drawn.orientations(found.modes[0].state))
-        if vertical is None:
-            return np.inf
         odometry, variance = self.graph.is_odometry, found.drawn.prepared.noise.step_variance
         square = (rotations.log(self.graph.target_from_source[odometry]) ** 2).sum(dim=1)
         # What noise alone would turn does not count.
         turned = (square - 3 * variance * self.graph.steps[odometry]).clamp_min(0.0).sqrt().sum()
-        return float(turned / (2 * np.pi) * np.log(vertical.variance))
+        return float(turned / (2 * np.pi) * np.log(MOST_TILT**2 if vertical is None else vertical.variance))
 
     def _from_mode(self, origin: Mode, drawn: Drawn, calibration: Calibration, most: float = np.inf) -> Found:
         """Result of a search from a mode with another calibration; not gone on with where F is more than ``most``."""
@@ -372,11 +384,13 @@ def _from_root(of_edge: Tensor, prepared: Prepared) -> np.ndarray:
     return accumulate_to_root(prepared.forest, np.where(parent_edge >= 0, of_edge.double().numpy()[parent_edge], 0.0))
 
 
-def _mended(mode: Mode) -> Mode:
-    """The same labels, but that no odometry slipped."""
+def _mended(mode: Mode) -> list[Mode]:
+    """The same labels, but that no odometry slipped; none if none did."""
+    if not len(mode.slipped):
+        return []
     trusted = mode.state.trusted.copy()
     trusted[mode.slipped] = 1.0
-    return Mode(mode.problem, *polish(mode.problem, replace(mode.state, trusted=trusted)), mode.origin)
+    return [Mode(mode.problem, *polish(mode.problem, replace(mode.state, trusted=trusted)), mode.origin)]
 
 
 def _moved(mode: Mode, before: Drawn, after: Drawn) -> State:

@@ -399,7 +399,7 @@ STRUCTURAL = {
     "objective": {"_UNKNOWN"},
     "problem": {"_NONE", "_SAME_TURNS"},
     "rows": {"_NOTHING", "_MAX_TURN", "_LEAST_REST", "_LONGEST_STRETCH"},
-    "solve": {"Begin", "_ROUNDS", "_LEAST_GAIN", "_SUSPICIOUS", "_TELLS", "_EDGE"},
+    "solve": {"Begin", "_ROUNDS", "_LEAST_GAIN", "_SUSPICIOUS", "_TELLS", "_HARDLY", "_EDGE"},
     "state": {"EXPONENTS", "COMMON_SHARES", "RUN_STEPS", "TURN_SHARES", "TAIL_SHARES", "STEP_TAIL_RATIOS"},
     "system": {"_MAX_LEVERAGE", "_NO_WEIGHT", "_MAX_PATTERNS", "_LACKING", "_MORE"},
 }

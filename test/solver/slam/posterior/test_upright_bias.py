@@ -61,9 +61,9 @@ def streets(seed: int, *, keyframes: int = 500, block: int = 30, blocks: int = 4
     return Streets(graph, torch.from_numpy(turn.inv().as_quat()))
 
 
-@pytest.mark.parametrize("seed", [0, 1, 3])
+@pytest.mark.parametrize("seed", [0, 2, 3, 12])
 def test_the_bias_is_found(seed: int) -> None:
-    """Slips, noise and tilts stood for it: 10.4, 4.4 and 8.1° off."""
+    """Slips, noise and tilts stood for it: 10.4, 4.3, 8.1 and 11.6° off."""
     drawn = streets(seed)
     solution = solve(drawn.graph)
     errors = orientation_errors(solution.body_from_world, drawn.body_from_world, drawn.graph.components())

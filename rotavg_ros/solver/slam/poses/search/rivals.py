@@ -38,11 +38,13 @@ class Rivals:
         modes: labellings.
         poses: poses of each labelling; here rotations are judged by places, too.
         share: probability of each.
+        cost: −log p of the likeliest, of rotations and translations, nats.
     """
 
     modes: list[Mode]
     poses: list[PoseMode]
     share: np.ndarray
+    cost: float
 
 
 def rival_poses(
@@ -80,7 +82,7 @@ def rival_poses(
     for rival in rivals:
         problem = replace(rival.pose.problem, mode=tuned(rival.mode))
         poses.append(estimate_poses(problem, start=PoseStart.at(rival.pose)))
-    return Rivals([rival.mode for rival in rivals], poses, share / share.sum())
+    return Rivals([rival.mode for rival in rivals], poses, share / share.sum(), float(cost[0]))
 
 
 def _begun(problem: PoseProblem, others: Sequence[PoseMode]) -> PoseMode:
