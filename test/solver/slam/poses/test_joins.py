@@ -157,7 +157,7 @@ def test_one_join_against_another_is_undecided(seed: int) -> None:
     streets = in_a_town(seed, good=1, false=1)
     solution = solve(streets.graph)
     score = solution.outlier_score.numpy()[streets.joins]
-    assert ((score > 0.3) & (score < 0.7)).all()
+    assert ((score > 0.25) & (score < 0.75)).all()
     assert score.sum() == pytest.approx(1.0, abs=0.05)
     assert any("move parts of the map" in warning for warning in solution.warnings)
     # Where the second robot is, beside the first one, is uncertain enough to cover the truth.
