@@ -184,7 +184,8 @@ def search(
         found = solver.from_starts(found.calibration, left.rotation_components)
         return replace(found, suspected=suspected)
     found, *others = (replace(each, tilts=solver.tilts(each)) for each in (found, as_said, *solver.tried))
-    near = [each for each in others if each.is_biased != found.is_biased and each.total < found.total + _HARDLY]
+    could = (each for each in others if each.is_biased != found.is_biased and not each.is_mounted_nearby)
+    near = [each for each in could if each.total < found.total + _HARDLY]
     return replace(found, suspected=suspected, otherwise=min(near, key=attrgetter("total"), default=None))
 
 
