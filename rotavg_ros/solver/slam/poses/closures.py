@@ -195,8 +195,11 @@ class Told:
 
     def alike_in(self, which: np.ndarray) -> np.ndarray:
         """``(C,)`` number of closures ``which``, ``(C,)`` bool, between the same two chains as each."""
+        count = int(self.chains.max(initial=0)) + 1
+        if count == 1:
+            return np.full(len(which), which.sum())
         first, second = np.sort(self.chains, axis=1).T
-        pair = np.unique(first * (int(self.chains.max(initial=0)) + 1) + second, return_inverse=True)[1]
+        pair = np.unique(first * count + second, return_inverse=True)[1]
         return np.asarray(np.bincount(pair, which)[pair])
 
     def detected_near(self, rows: np.ndarray, tells: np.ndarray, *, in_order: bool) -> Near:

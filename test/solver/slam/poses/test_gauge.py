@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros import solve
 from rotavg_ros.solver.slam.poses.rows import Arms, jacobian
-from rotavg_ros.view_graph import EdgeKind, ViewGraph
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
 
 from .test_joins import LENGTH, in_a_town
 from .test_poses import HILLS, graph_of, pose_mode, simulated
@@ -51,6 +53,19 @@ def test_nothing_predicts_the_only_closure_that_joins_a_robot() -> None:
     pose = pose_mode(graph)
     join = np.flatnonzero(~pose.problem.within_chain)
     np.testing.assert_allclose(pose.solved.factor.redundancy[pose.problem.mode.problem.closure[join]], 0.0, atol=1e-6)
+
+
+def test_a_robot_whose_only_join_is_rejected_is_anywhere_on_the_map() -> None:
+    """It was stated to 20° and a kilometre, and without residuals that hold it would be to a hundred turns."""
+    graph = joined_by_one_closure()
+    label = graph.label.clone()
+    label[between_robots(graph)] = int(EdgeLabel.REJECTED)
+    solution = solve(replace(graph, label=label))
+    assert solution.position is not None and solution.position_uncertainty is not None
+    turn, shift = solution.uncertainty[LENGTH:].numpy(), solution.position_uncertainty[LENGTH:].numpy()
+    spread = float(np.var(solution.position.numpy()[:, :2], axis=0).mean()) ** 0.5
+    assert (turn > np.pi / 2).all() and (turn < np.pi).all()
+    assert (shift > spread).all() and (shift < 5 * spread).all()
 
 
 def test_the_only_closure_that_joins_a_robot_is_false_as_often_as_others() -> None:

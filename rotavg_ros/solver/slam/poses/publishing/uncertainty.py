@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from rotavg_ros.solver.slam.poses.publishing.inner_nodes import InnerNodes, NodePoses
-from rotavg_ros.solver.slam.poses.rows import crossed
+from rotavg_ros.solver.slam.poses.rows import crossed, loose_weight
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 
 
@@ -23,7 +23,14 @@ def variances(pose: PoseMode, nodes: NodePoses) -> tuple[np.ndarray, np.ndarray]
     square[inner.node] = np.diagonal(inner.covariance(pose), axis1=1, axis2=2)
     if not drawn.is_held_at_first:
         square = np.maximum(square + _seen_from_first(pose, nodes, inner), 0.0)
-    return square[:, :k].mean(axis=1), square[:, k:].mean(axis=1)
+    turn, shift = square[:, :k].mean(axis=1), square[:, k:].mean(axis=1)
+    # The solve has no prior of where a chain lies that closures alone join to a root: if they tell nothing, it is this.
+    unknown = 1 / loose_weight(pose.problem, pose.solved.scale.extent)
+    is_loose = ~np.isin(drawn.chain, drawn.chain[drawn.roots])[drawn.above]
+    return (
+        np.where(is_loose, turn * unknown[0] / (turn + unknown[0]), turn),
+        np.where(is_loose, shift * unknown[-1] / (shift + unknown[-1]), shift),
+    )
 
 
 def _seen_from_first(pose: PoseMode, nodes: NodePoses, inner: InnerNodes) -> np.ndarray:
