@@ -75,7 +75,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "learning": {"diagnosis", "neurora", "slam"},
         "diagnosis": {"neurora", "slam"},
         "positions": {"algebra"},
-        "warnings": {"algebra", "running"},
+        "warnings": {"algebra", "running", "slam"},
         "neurora": {"algebra", "running"},
         "networks": {"neurora", "slam"},
         "methods": {"sfm", "slam"},
@@ -97,6 +97,14 @@ ROOMS: dict[str, dict[str, set[str]]] = {
                 "warnings",
             ),
         },
+    },
+    "solver/warnings": {
+        "": {"flagged", "whole_solve"},
+        "odometry": set(),
+        "flagged": set(),
+        "conventions": {"odometry"},
+        "lone_places": {"odometry"},
+        "whole_solve": {"conventions", "flagged", "lone_places", "odometry"},
     },
     "solver/neurora": {
         "": set(),

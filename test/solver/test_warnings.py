@@ -246,7 +246,62 @@ def test_few_closures_that_turn_the_answer() -> None:
     assert warnings.of_whole_solve(ten, turned, torch.zeros(ten.num_edges)) == ()
     # Odometry that does not connect all says nothing of what closures join.
     apart = nine.select_edges(torch.arange(nine.num_edges) != 4)
-    assert warnings.of_whole_solve(apart, turned, torch.zeros(apart.num_edges)) == ()
+    (text,) = warnings.of_whole_solve(apart, turned, torch.zeros(apart.num_edges))
+    assert text.startswith("5 of 10 keyframes are joined to the rest by 9 loop closures of a single pair of places")
+
+
+LAPS = {"a": range(100), "b": range(100, 160), "c": range(160, 200)}
+
+
+def of_fleet(*joins: tuple[int, int], label: EdgeLabel = EdgeLabel.AUTOMATIC) -> ViewGraph:
+    """Three robots of 100, 60 and 40 keyframes, with closures between some keyframes; the first has ``label``."""
+    steps = [(node, node + 1) for lap in LAPS.values() for node in lap[:-1]]
+    source, target = np.array([*steps, *joins]).T
+    kind = [EdgeKind.ODOMETRY] * len(steps) + [EdgeKind.LOOP_CLOSURE] * len(joins)
+    labels = [EdgeLabel.AUTOMATIC] * len(steps) + [label] + [EdgeLabel.AUTOMATIC] * (len(joins) - 1)
+    return ViewGraph.create(source, target, rotations.identity(len(source)), kind=kind, label=labels, num_nodes=200)
+
+
+def of_answer(graph: ViewGraph, score: Tensor | None = None) -> tuple[str, ...]:
+    score = torch.zeros(graph.num_edges) if score is None else score
+    return warnings.of_whole_solve(graph, rotations.identity(graph.num_nodes), score)
+
+
+RUN = tuple((10 + number, 105 + number) for number in range(5))
+
+
+def test_robots_that_one_pair_of_places_joins() -> None:
+    lone = of_fleet(*RUN)
+    (text,) = of_answer(lone)
+    assert text.startswith("60 of 200 keyframes are joined to the rest by 5 loop closures of a single pair of places ")
+    # A third robot that nothing joins is no part of it; one that hangs on the second moves with it.
+    (text,) = of_answer(of_fleet(*RUN, (150, 170), (105, 165)))
+    assert text.startswith("100 of 200 keyframes are joined to the rest by 5 loop closures")
+    (text,) = of_answer(of_fleet(*RUN, (150, 170)))
+    assert text.startswith("100 of 200 keyframes are joined to the rest by 6 loop closures of a single pair of places")
+    assert "each alone" in text
+    # Joins elsewhere, at either end, would contradict them.
+    for elsewhere in ((80, 107), (12, 155)):
+        assert of_answer(of_fleet(*RUN, elsewhere)) == ()
+    assert of_answer(of_fleet(*RUN, (150, 170), (70, 165))) == ()
+    # What is flagged or rejected joins nothing, and who has accepted one need not look.
+    score = torch.zeros(lone.num_edges)
+    score[-5:] = 0.9
+    assert of_answer(lone, score) == ()
+    assert of_answer(of_fleet(*RUN[:1], label=EdgeLabel.REJECTED)) == ()
+    assert of_answer(of_fleet(*RUN, label=EdgeLabel.ACCEPTED)) == ()
+
+
+def test_lone_places_do_not_depend_on_order() -> None:
+    rng = np.random.default_rng(0)
+    for joins in (RUN, (*RUN, (150, 170)), (*RUN, (80, 107)), (*RUN, (150, 170), (70, 165))):
+        graph = of_fleet(*joins)
+        name, order = torch.from_numpy(rng.permutation(200)), torch.from_numpy(rng.permutation(graph.num_edges))
+        turned = torch.from_numpy(rng.random(graph.num_edges) < 0.5)
+        ends = torch.stack((graph.source, graph.target))
+        source, target = name[torch.where(turned, ends.flip(0), ends)][:, order]
+        rotation, kind = graph.target_from_source[order], graph.kind[order]
+        assert of_answer(ViewGraph.create(source, target, rotation, kind=kind, num_nodes=200)) == of_answer(graph)
 
 
 def _joined(a: ViewGraph, b: ViewGraph) -> ViewGraph:
