@@ -283,6 +283,7 @@ def test_robots_that_one_pair_of_places_joins() -> None:
     # Joins elsewhere, at either end, would contradict them.
     for elsewhere in ((80, 107), (12, 155)):
         assert of_answer(of_fleet(*RUN, elsewhere)) == ()
+    assert of_answer(of_fleet(*RUN, *((number, 160 + number) for number in range(0, 30, 5)))) == of_answer(lone)
     assert of_answer(of_fleet(*RUN, (150, 170), (70, 165))) == ()
     # What is flagged or rejected joins nothing, and who has accepted one need not look.
     score = torch.zeros(lone.num_edges)

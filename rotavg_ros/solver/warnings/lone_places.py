@@ -15,7 +15,8 @@ from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 def lone_places(odometry: Odometry, believed: ViewGraph) -> str | None:
     """Warns of parts of the map that closures of one pair of places alone join to the largest part.
 
-    Not if a user has accepted one of these closures.
+    These have both ends within :data:`STRETCH` odometry edges, and within half of either part's length. Not if a user
+    has accepted one of them.
 
     Args:
         odometry: of a graph of N nodes.
@@ -35,8 +36,11 @@ def lone_places(odometry: Odometry, believed: ViewGraph) -> str | None:
     pair, of_pair, number = np.unique(ends.T, axis=0, return_inverse=True, return_counts=True)
     is_accepted = (believed.label == EdgeLabel.ACCEPTED).numpy()[joins]
     is_one_place = np.bincount(of_pair, is_accepted) == 0
-    for of_end in along:
-        is_one_place &= _spread(of_end, of_pair) <= STRETCH
+    # What is seen along most of a robot's way is not one place, however short that is.
+    farthest = np.zeros(count)
+    np.maximum.at(farthest, part, level)
+    for of_end, of_parts in zip(along, pair.T, strict=True):
+        is_one_place &= _spread(of_end, of_pair) <= np.minimum(STRETCH, farthest[of_parts] / 2)
     # Pairs that more than one place joins count twice, so neither joins alone.
     others = np.concatenate((pair, pair[~is_one_place]))
     is_lone = ~joined_by_others(count, others)[: len(pair)]
