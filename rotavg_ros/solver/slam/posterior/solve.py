@@ -286,15 +286,17 @@ class _Solver(NamedTuple):
     def _better(self, found: Found, part: str) -> Found | None:
         """Result of a search from the best mode after that step, if F falls; a bias may also start otherwise.
 
-        Noise, slips and tilts may stand for what a bias does. So where a step tells of one, F decides with noise of its
-        own, if need be from the best mode without its slips, or about the body's vertical alone.
+        Noise, slips and tilts may stand for what a bias does, and where it bends the map by more than a turn, all right
+        closures may be held false. So where a step tells of one, F decides with noise of its own, if need be from the
+        best mode without its slips, from one that believes these closures, or about the body's vertical alone.
         """
         best = found.modes[0]
         starts: list[tuple[Mode, np.ndarray | None]] = [(best, None)]
         if part == "bias":
             vertical = None if found.is_biased else self._body_vertical(found)
             axes = (None,) if vertical is None else (None, vertical)
-            starts = [(origin, axis) for origin in (best, *_mended(best)) for axis in axes]
+            others = [] if found.is_biased else _believing_more(found.modes)
+            starts = [(origin, axis) for origin in (best, *_mended(best), *others) for axis in axes]
         for origin, axis in starts:
             step = self.predicted(found, part, origin, axis)
             is_promised = step.cost < -_LEAST_GAIN and axis is None
@@ -383,6 +385,12 @@ def _from_root(of_edge: Tensor, prepared: Prepared) -> np.ndarray:
     """``(N,)`` sums of the edges' values ``(M,)`` along the forest, from each node's root."""
     parent_edge = prepared.forest.parent_edge
     return accumulate_to_root(prepared.forest, np.where(parent_edge >= 0, of_edge.double().numpy()[parent_edge], 0.0))
+
+
+def _believing_more(modes: list[Mode]) -> list[Mode]:
+    """The likeliest mode with less than half of the false closures of the best; none if there is none."""
+    false = int(modes[0].is_false.sum())
+    return [mode for mode in modes if 2 * int(mode.is_false.sum()) < false][:1]
 
 
 def _mended(mode: Mode) -> list[Mode]:
