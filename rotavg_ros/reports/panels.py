@@ -117,13 +117,14 @@ def over_time(
     *,
     from_zero: bool = True,
 ) -> None:
-    """Curves over times in any order; unknown values are left out.
+    """Curves over times in any order; unknown values are left out. Called again, it adds to what is drawn.
 
     Args:
         unit: appended to the numbers on the axis.
         from_zero: whether the axis begins at zero and the area below a curve is tinted.
     """
     order = np.argsort(time, kind="stable")
+    axes.set_autoscaley_on(True)  # the limit below ends it, and these curves may be higher than earlier ones
     for name, (values, colour) in curves.items():
         known = order[np.isfinite(values[order])]
         look: dict[str, Any] = {"marker": _marker(len(known)), "markersize": 4, "linewidth": 1.4}

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online import Answer, RejectReason
 from rotavg_ros.replay.record import RunRecord, TopicUse
@@ -22,8 +23,8 @@ from rotavg_ros.reports.facts import RunFacts
 from rotavg_ros.reports.page import page_of
 from rotavg_ros.reports.report import PICTURES
 from rotavg_ros.reports.tables import WHY_REFUSED
-from rotavg_ros.reports.theme import DARK, LIGHT
-from rotavg_ros.reports.time_pictures import ticks
+from rotavg_ros.reports.theme import DARK, LIGHT, Theme
+from rotavg_ros.reports.time_pictures import orientation, ticks, uncertainty
 from rotavg_ros.view_graph import EdgeKind
 
 from .records import record_of, simulated_run, two_robots, without_closures, without_positions, without_reference
@@ -256,6 +257,25 @@ def test_a_tick_that_compiles_for_a_minute_hides_no_other(record: RunRecord) -> 
     assert 0 < shown[0, 1] < shown[1, 1] < 1
     others = upper.transData.transform([[0.0, 1000 * tick.seconds] for tick in slow[1:]])[:, 1]
     assert np.ptp(others) > 5  # pixels
+
+
+@pytest.mark.parametrize("draw", [orientation, uncertainty])
+def test_no_robots_curve_leaves_its_panel(draw: Callable[[RunFacts, Theme], Figure | None], record: RunRecord) -> None:
+    robots = two_robots(without_reference(record))
+    first, second = robots.robots
+    drifting = Rotation.from_rotvec(np.outer(np.arange(len(second.nodes)), [0.0, 0.0, 0.01]))
+    second = replace(
+        second,
+        odometry_world_from_body=(drifting * Rotation.from_quat(second.world_from_body)).as_quat(),
+        uncertainty=10 * second.uncertainty,
+    )
+    figure = draw(RunFacts(replace(robots, robots=(first, second))), LIGHT)
+    assert figure is not None
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    bottom, top = axes.get_ylim()
+    assert len(axes.lines) == 2 and bottom == 0
+    assert all(np.asarray(line.get_ydata()).max() <= top for line in axes.lines)
 
 
 def judged(record: RunRecord, outlier: np.ndarray, rotation_score: np.ndarray) -> RunFacts:
