@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, get_font
 
 WIDTH = 5.6  # inches, for every picture: the text is readable on a phone as well
 _PIXELS_PER_INCH = 170
@@ -90,12 +92,31 @@ def style(axes: Axes, title: str, *, ink: str, muted: str, grid: str) -> None:
 
 
 def plain(name: str) -> str:
-    """A name from outside as a short label that matplotlib draws literally: neither mathematics nor hidden."""
-    printable = "".join(letter if letter.isprintable() else "?" for letter in name)
-    if len(printable) > _LONGEST_LABEL:
-        printable = printable[: _LONGEST_LABEL - 1] + "…"
-    label = printable.replace("$", r"\$")
+    """A name from outside as a short label that matplotlib draws literally: neither mathematics nor hidden.
+
+    Of a long name the middle is left out: robots' names often differ at the end alone.
+    """
+    shown = drawable(name)
+    if len(shown) > _LONGEST_LABEL:
+        half = _LONGEST_LABEL // 2
+        shown = f"{shown[:half]}…{shown[half + 1 - _LONGEST_LABEL :]}"
+    label = shown.replace("$", r"\$")
     return f"\u200a{label}" if label.startswith("_") else label
+
+
+def drawable(text: str) -> str:
+    """A text from outside with a question mark for every letter that the font lacks, or that is not printable."""
+    letters = _letters()
+    return "".join(letter if letter.isprintable() and ord(letter) in letters else "?" for letter in text)
+
+
+@cache
+def _letters() -> frozenset[int]:
+    """Unicode numbers of the letters that the font has, both in regular and in bold."""
+    regular, bold = (
+        frozenset(get_font(findfont(FontProperties(weight=weight))).get_charmap()) for weight in ("normal", "bold")
+    )
+    return regular & bold
 
 
 LIGHT = Theme(

@@ -23,7 +23,7 @@ from rotavg_ros.reports.facts import RunFacts
 from rotavg_ros.reports.page import page_of
 from rotavg_ros.reports.report import PICTURES
 from rotavg_ros.reports.tables import WHY_REFUSED
-from rotavg_ros.reports.theme import DARK, LIGHT, Theme
+from rotavg_ros.reports.theme import DARK, LIGHT, Theme, plain
 from rotavg_ros.reports.time_pictures import orientation, ticks, uncertainty
 from rotavg_ros.view_graph import EdgeKind
 
@@ -139,6 +139,24 @@ def test_what_a_bag_says_is_shown_and_not_obeyed(record: RunRecord, tmp_path: Pa
     assert "script" not in page.tags
     assert page.tags.count("img") == len(page.images)
     assert page.text.count(evil.replace("\ud800", "?")) >= 6
+
+
+@pytest.mark.parametrize(
+    ("name", "label"),
+    [
+        ("ロボット 1", "???? 1"),
+        ("Робот", "Робот"),
+        ("warehouse_floor_3_robot_11", "warehouse_…_robot_11"),
+        ("warehouse_floor_3_robot_12", "warehouse_…_robot_12"),
+        ("exactly_twenty_chars", "exactly_twenty_chars"),
+        ("$x$", r"\$x\$"),
+    ],
+)
+def test_labels_of_robots_are_readable_and_differ(name: str, label: str) -> None:
+    assert plain(name) == label
+    figure = LIGHT.figure(2, 2)
+    figure.text(0, 0, plain(name))
+    figure.canvas.draw()  # warnings are errors: no letter is missing
 
 
 def test_a_page_says_what_is_missing(record: RunRecord, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.evaluation.common.plots import BLUE, INK, MUTED, ORANGE, style
+from rotavg_ros.reports.theme import drawable
 from rotavg_ros.solver import solve
 from rotavg_ros.view_graph import ViewGraph
 
@@ -67,7 +68,7 @@ def draw(path: Path, noise: EdgeNoise, title: str, outlier_angle_deg: float) -> 
     """
     figure = Figure(figsize=(13, 4.6), dpi=150, facecolor="white")
     grid = figure.add_gridspec(1, 2, width_ratios=(1, 1.25), left=0.06, right=0.99, top=0.8, bottom=0.14, wspace=0.1)
-    figure.text(0.025, 0.94, title, fontsize=14, fontweight="bold", color=INK, va="center", parse_math=False)
+    figure.text(0.025, 0.94, drawable(title), fontsize=14, fontweight="bold", color=INK, va="center", parse_math=False)
     what = "residuals of the solution; the truth is unknown" if noise.is_residual else "noise against the truth"
     quantiles = np.percentile(noise.angle_deg, (50, 90)) if len(noise.angle_deg) else (np.nan, np.nan)
     outliers = 100 * (noise.angle_deg > outlier_angle_deg).mean() if len(noise.angle_deg) else np.nan

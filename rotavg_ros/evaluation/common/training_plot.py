@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.plots import MUTED, PALETTE, line_of, style
+from rotavg_ros.reports.theme import drawable
 
 
 class TrainingLogError(UserError):
@@ -54,7 +55,7 @@ def draw_training(path: Path, logs: Sequence[Path]) -> None:
             fontsize=8,
             color=MUTED,
         )
-        style(axes, log.name.removesuffix(".log.jsonl").replace("$", r"\$"))  # no mathematics
+        style(axes, drawable(log.name.removesuffix(".log.jsonl")).replace("$", r"\$"))  # no mathematics
         axes.set_xlabel("epoch", fontsize=9, color=MUTED)
         axes.set_ylabel("validation", fontsize=9, color=MUTED)
     figure.savefig(path)

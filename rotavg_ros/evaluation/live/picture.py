@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rotavg_ros.evaluation.live.played_run import LiveReport
 from rotavg_ros.reports.panels import DASHED, Clock, over_time, score_histogram, segments, square_map
-from rotavg_ros.reports.theme import LIGHT
+from rotavg_ros.reports.theme import LIGHT, drawable
 
 _KEPT = LIGHT.robots[1]  # the corrected trajectory beside it is blue
 
@@ -23,7 +23,8 @@ def draw(report: LiveReport, path: Path, title: str) -> None:
     grid = figure.add_gridspec(
         2, 2, width_ratios=(1.45, 1), left=0.03, right=0.97, top=0.82, bottom=0.13, wspace=0.1, hspace=0.5
     )
-    figure.text(0.03, 0.95, title, fontsize=17, fontweight="bold", color=LIGHT.ink, va="center", parse_math=False)
+    heading = drawable(title)
+    figure.text(0.03, 0.95, heading, fontsize=17, fontweight="bold", color=LIGHT.ink, va="center", parse_math=False)
     figure.text(0.03, 0.907, _subtitle(report), fontsize=11, color=LIGHT.muted, va="center")
     _draw_map(figure.add_subplot(grid[:, 0]), report)
     if report.knows_errors:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from rotavg_ros.datasets.simulation.synthetic import ReleasedRecipe
-from rotavg_ros.evaluation.common.noise_plot import edge_noise
+from rotavg_ros.evaluation.common.noise_plot import draw, edge_noise
 
 
 def test_noise_of_a_synthetic_graph_is_its_own() -> None:
@@ -16,3 +18,9 @@ def test_noise_of_a_synthetic_graph_is_its_own() -> None:
     assert np.nanmedian(np.abs(noise.axis[:, 2])) < 0.15
     assert not noise.is_residual
     assert edge_noise(sample.graph, None).is_residual
+
+
+def test_a_title_in_letters_that_the_font_lacks_is_drawn_without_a_warning(tmp_path: Path) -> None:
+    sample = ReleasedRecipe(cameras=(10, 10)).sample(np.random.default_rng(0))
+    draw(tmp_path / "noise.png", edge_noise(sample.graph, sample.body_from_world), "ロボット.g2o", 20.0)
+    assert (tmp_path / "noise.png").stat().st_size > 0
