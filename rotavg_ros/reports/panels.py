@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from rotavg_ros.reports.theme import Theme
@@ -109,6 +109,16 @@ def square_map(axes: Axes) -> None:
         axis.set_major_locator(MaxNLocator(nbins=6, integer=False))
 
 
+def counts_over_time(axes: Axes, time: FloatArray, curves: Mapping[str, tuple[Sequence[int], str]]) -> None:
+    """Counts and colours by name over ascending times: steps from zero, with whole numbers on the axis."""
+    for name, (counts, colour) in curves.items():
+        look: dict[str, Any] = {"marker": _marker(len(counts)), "markersize": 4, "linewidth": 1.4}
+        axes.plot(time, counts, drawstyle="steps-post", color=colour, label=name, **look)
+    most = max((max(counts, default=0) for counts, _ in curves.values()), default=0)
+    axes.set_ylim(0, max(1.05 * most, 1.0))
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
+
+
 def over_time(
     axes: Axes,
     time: FloatArray,
@@ -157,6 +167,13 @@ def score_histogram(axes: Axes, groups: Sequence[tuple[str, FloatArray, str]]) -
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_xlim(-0.01, 1.01)
     axes.set_ylim(bottom=0)
+
+
+class PlainLogFormatter(LogFormatter):
+    """Writes 60 where matplotlib has 6 × 10¹, and labels the same ticks as it does."""
+
+    def __call__(self, value: float, position: int | None = None) -> str:
+        return f"{value:g}" if super().__call__(value, position) else ""
 
 
 def score_bar(axes: Axes, theme: Theme, label: str = "outlier score") -> None:

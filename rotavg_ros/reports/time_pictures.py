@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from rotavg_ros.reports.facts import RunFacts
-from rotavg_ros.reports.panels import Curves, over_time
+from rotavg_ros.reports.panels import Curves, PlainLogFormatter, counts_over_time, over_time
 from rotavg_ros.reports.theme import WIDTH, Theme, plain
 
 FloatArray = NDArray[np.float64]
@@ -112,16 +112,16 @@ def ticks(facts: RunFacts, theme: Theme) -> Figure | None:
             upper.plot(time[chosen], milliseconds[chosen], marker, color=colour, markersize=4, label=label)
     # A first run on a machine compiles for a minute, other ticks take milliseconds.
     upper.set_yscale("log")
-    upper.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    upper.yaxis.set_major_formatter(PlainLogFormatter())
+    upper.yaxis.set_minor_formatter(PlainLogFormatter())  # where the ticks span less than a decade
     upper.margins(x=0.02, y=0.15)
     theme.dress(upper, "Time of every tick", y="milliseconds", legend_rows=1)
-    for name, values, colour in (
-        ("keyframes", [tick.keyframes for tick in ticks], theme.corrected),
-        ("edges", [tick.edges for tick in ticks], theme.odometry),
-    ):
-        lower.plot(time, values, drawstyle="steps-post", color=colour, linewidth=1.4, label=f"{name} ({values[-1]})")
-    lower.set_ylim(bottom=0)
-    lower.yaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
+    keyframes, edges = [tick.keyframes for tick in ticks], [tick.edges for tick in ticks]
+    growth = {
+        f"keyframes ({keyframes[-1]})": (keyframes, theme.corrected),
+        f"edges ({edges[-1]})": (edges, theme.odometry),
+    }
+    counts_over_time(lower, time, growth)
     theme.dress(lower, "Growth of the graph", facts.clock.unit, "count", legend_rows=1)
     return figure
 
@@ -135,16 +135,14 @@ def flips(facts: RunFacts, theme: Theme) -> Figure | None:
     changed = np.array([tick.flips for tick in ticks])
     figure = theme.figure(WIDTH, 4.2)
     upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (1.3, 1)})
-    upper.plot(time, [tick.outliers for tick in ticks], drawstyle="steps-post", color=theme.flagged, linewidth=1.4)
-    upper.set_ylim(bottom=0)
+    counts_over_time(upper, time, {"flagged": ([tick.outliers for tick in ticks], theme.flagged)})
     upper.margins(x=0.02)
     theme.dress(upper, "Edges flagged as false so far", y="edges")
     lower.vlines(time, 0, changed, color=theme.ink, linewidth=1.4)
     lower.set_ylim(0, max(1.1 * float(changed.max(initial=0)), 1.0))
     theme.dress(lower, f"Verdicts that changed from one tick to the next ({int(changed.sum())})", facts.clock.unit)
     lower.set_ylabel("edges", fontsize=9, color=theme.muted)
-    for axes in (upper, lower):
-        axes.yaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
+    lower.yaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
     return figure
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -24,7 +25,7 @@ from rotavg_ros.reports.page import page_of
 from rotavg_ros.reports.report import PICTURES
 from rotavg_ros.reports.tables import WHY_REFUSED
 from rotavg_ros.reports.theme import DARK, LIGHT, Theme, plain
-from rotavg_ros.reports.time_pictures import orientation, ticks, uncertainty
+from rotavg_ros.reports.time_pictures import flips, orientation, ticks, uncertainty
 from rotavg_ros.view_graph import EdgeKind
 
 from .records import record_of, simulated_run, two_robots, without_closures, without_positions, without_reference
@@ -294,6 +295,34 @@ def test_no_robots_curve_leaves_its_panel(draw: Callable[[RunFacts, Theme], Figu
     bottom, top = axes.get_ylim()
     assert len(axes.lines) == 2 and bottom == 0
     assert all(np.asarray(line.get_ydata()).max() <= top for line in axes.lines)
+
+
+def labels_of(axes: Axes) -> list[str]:
+    """The texts beside the vertical axis, those without text left out."""
+    assert axes.figure is not None
+    axes.figure.canvas.draw()
+    return [text for label in axes.yaxis.get_ticklabels(which="both") if (text := label.get_text())]
+
+
+def test_axes_of_ticks_have_plain_and_whole_numbers(record: RunRecord) -> None:
+    quick = [replace(tick, seconds=0.003 + 0.0001 * number) for number, tick in enumerate(record.ticks)]
+    figure = ticks(RunFacts(replace(record, ticks=tuple(quick))), LIGHT)
+    assert figure is not None
+    assert len(labels_of(figure.axes[0])) > 2
+    assert all(float(label) > 0 for label in labels_of(figure.axes[0]))
+    clean = [replace(tick, outliers=0, flips=0) for tick in record.ticks]
+    figure = flips(RunFacts(replace(record, ticks=tuple(clean))), LIGHT)
+    assert figure is not None
+    for axes in figure.axes:
+        assert labels_of(axes) == ["0", "1"]
+
+
+@pytest.mark.parametrize("draw", [ticks, flips])
+def test_a_single_tick_is_seen(draw: Callable[[RunFacts, Theme], Figure | None], record: RunRecord) -> None:
+    figure = draw(RunFacts(replace(record, ticks=record.ticks[-1:])), LIGHT)
+    assert figure is not None
+    curves = [line for axes in figure.axes for line in axes.lines]
+    assert curves and all(line.get_marker() not in ("", "None") for line in curves)
 
 
 def judged(record: RunRecord, outlier: np.ndarray, rotation_score: np.ndarray) -> RunFacts:
