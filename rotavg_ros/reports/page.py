@@ -179,6 +179,11 @@ def _trajectory(facts: RunFacts) -> Section:
             "Odometry and the corrected trajectory are each laid onto the reference as a whole, by one rotation and "
             "one shift, without scaling (as evo_ape --align does)."
         )
+        if alone := [track.robot for track in tracks_of(facts) if track.reference is None]:
+            text.append(
+                f"Without a reference with positions: {', '.join(alone)}, moved as a robot that it is joined with, "
+                "if there is one; its odometry starts at its corrected trajectory's first pose."
+            )
     return Section("trajectory", "Trajectory", text, ["trajectory", "position_error"])
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,12 +42,42 @@ class Tracks:
 
 
 def tracks_of(facts: RunFacts) -> list[Tracks]:
-    """The tracks of all robots that have positions."""
+    """The tracks of all robots that have positions.
+
+    A robot without a reference of its own lies beside the others as in the answer: it is moved as one of those is that
+    has a reference, and that edges join with it.
+    """
+    robots = facts.record.robots
+    laid = [_onto_reference(*each) for each in zip(robots, facts.comparisons, strict=True)]
+    fits = [None if on is None else on.fit for on in laid]
     return [
-        _lay_together(robot, comparison, corrected, facts.time(robot.stamp_ns))
-        for robot, comparison in zip(facts.record.robots, facts.comparisons, strict=True)
-        if (corrected := best_position(robot)) is not None
+        _lay_together(robot, on or _Laid(_of_a_joined_robot(facts, robot, fits)), facts.time(robot.stamp_ns))
+        for robot, on in zip(robots, laid, strict=True)
+        if best_position(robot) is not None
     ]
+
+
+class _Laid(NamedTuple):
+    """How a robot's corrected positions are moved, None: not at all, and onto which positions of its own reference."""
+
+    fit: RigidFit | None
+    truth: FloatArray | None = None
+
+
+def _onto_reference(robot: RobotRecord, comparison: RobotComparison | None) -> _Laid | None:
+    """None without a reference that has at least two of the robot's positions."""
+    corrected = best_position(robot)
+    truth = None if comparison is None else comparison.truth.position
+    fit = None if truth is None or corrected is None else fit_onto(corrected, truth)
+    return None if fit is None else _Laid(fit, truth)
+
+
+def _of_a_joined_robot(facts: RunFacts, robot: RobotRecord, fits: Sequence[RigidFit | None]) -> RigidFit | None:
+    component = facts.record.answer.component
+    for other, fit in zip(facts.record.robots, fits, strict=True):
+        if fit is not None and np.isin(component[robot.nodes], component[other.nodes]).any():
+            return fit
+    return None
 
 
 def node_positions(facts: RunFacts) -> FloatArray:
@@ -71,23 +103,17 @@ def best_position(robot: RobotRecord) -> FloatArray | None:
     return robot.position if robot.position is not None else robot.position_dead_reckoned
 
 
-def _lay_together(
-    robot: RobotRecord, comparison: RobotComparison | None, corrected: FloatArray, time: FloatArray
-) -> Tracks:
-    """Align everything with the reference as well as possible; without one, odometry starts where the answer does."""
-    truth = None if comparison is None else comparison.truth.position
-    fit = None if truth is None else fit_onto(corrected, truth)
-    odometry = robot.odometry_position
+def _lay_together(robot: RobotRecord, laid: _Laid, time: FloatArray) -> Tracks:
+    """Align odometry with the reference, too, as well as possible; without one it starts where the answer does."""
+    corrected, odometry = best_position(robot), robot.odometry_position
+    assert corrected is not None
+    fit = laid.fit or RigidFit(Rotation.identity(), np.zeros(3))
     if odometry is not None:
-        odometry_fit = None if truth is None or fit is None else fit_onto(odometry, truth)
-        odometry = (odometry_fit or _same_start(robot, odometry, corrected))(odometry)
-    return Tracks(
-        robot=robot.robot,
-        time=time,
-        odometry=odometry,
-        corrected=corrected if fit is None else fit(corrected),
-        reference=None if fit is None else truth,
-    )
+        onto_truth = None if laid.truth is None else fit_onto(odometry, laid.truth)
+        odometry = (
+            fit(_same_start(robot, odometry, corrected)(odometry)) if onto_truth is None else onto_truth(odometry)
+        )
+    return Tracks(robot=robot.robot, time=time, odometry=odometry, corrected=fit(corrected), reference=laid.truth)
 
 
 def _same_start(robot: RobotRecord, odometry: FloatArray, corrected: FloatArray) -> RigidFit:

@@ -26,6 +26,7 @@ from rotavg_ros.reports.report import PICTURES
 from rotavg_ros.reports.tables import WHY_REFUSED
 from rotavg_ros.reports.theme import DARK, LIGHT, Theme, plain
 from rotavg_ros.reports.time_pictures import flips, orientation, ticks, uncertainty
+from rotavg_ros.reports.tracks import best_position, tracks_of
 from rotavg_ros.view_graph import EdgeKind
 
 from .records import record_of, simulated_run, two_robots, without_closures, without_positions, without_reference
@@ -200,6 +201,22 @@ def test_a_reference_at_another_time(record: RunRecord, tmp_path: Path) -> None:
     page = Page(write_report(replace(record, robots=(replace(robot, reference=late),)), tmp_path))
     assert "check its clock" in page.text
     assert "position_error" not in page.images
+
+
+def test_a_robot_without_a_reference_lies_beside_the_others(record: RunRecord) -> None:
+    robots = two_robots(record)
+    alpha, beta = robots.robots
+    both = tracks_of(RunFacts(robots))
+    facts = RunFacts(replace(robots, robots=(alpha, replace(beta, reference=None))))
+    one = tracks_of(facts)
+    np.testing.assert_array_equal(one[0].corrected, both[0].corrected)
+    np.testing.assert_allclose(one[1].corrected, both[1].corrected, atol=0.5)  # the reference's world is metres away
+    assert one[1].odometry is not None and one[1].reference is None
+    np.testing.assert_allclose(one[1].odometry[0], one[1].corrected[0], atol=1e-9)
+    assert "reference with positions: beta" in " ".join(page_of(facts).sections[0].text)
+    apart = replace(robots.answer, component=robots.answer.keyframe_robot.astype(np.int64))
+    (_, unjoined) = tracks_of(replace(facts, record=replace(facts.record, answer=apart)))
+    np.testing.assert_array_equal(unjoined.corrected, best_position(beta))
 
 
 def test_an_empty_run(record: RunRecord, tmp_path: Path) -> None:
