@@ -19,6 +19,7 @@ from rotavg_ros.reports.tables import (
     stage_table,
     topic_table,
 )
+from rotavg_ros.reports.time_pictures import MOST_ROBOTS
 from rotavg_ros.reports.tracks import tracks_of
 from rotavg_ros.view_graph import FALSE_CLOSURE_M
 from rotavg_ros.wording import counted
@@ -198,6 +199,8 @@ def _orientations(facts: RunFacts) -> Section:
             "Errors are angles to the reference after one rotation of the whole trajectory onto it (robust, per "
             "connected part of the graph).",
         ]
+        if len(compared) > MOST_ROBOTS:
+            text.append(f"The pictures show the first {MOST_ROBOTS} robots with a reference, the table all.")
         tables = [error_table(facts)]
     elif any(robot.reference is not None for robot in facts.record.robots):
         text = ["The reference has no sample within 0.15 s of any keyframe, so errors are not known: check its clock."]

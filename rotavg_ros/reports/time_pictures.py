@@ -16,13 +16,13 @@ from rotavg_ros.reports.theme import WIDTH, Theme, plain
 
 FloatArray = NDArray[np.float64]
 
-_MOST_ROBOTS = 6  # with a panel of their own
+MOST_ROBOTS = 6  # with a panel of their own
 _LEAVES_THE_PLANE = np.radians(0.5)
 
 
 def orientation(facts: RunFacts, theme: Theme) -> Figure | None:
     """Error of the orientations; without a reference, the rotation from odometry to the answer."""
-    compared = list(facts.compared)[:_MOST_ROBOTS]
+    compared = list(facts.compared)[:MOST_ROBOTS]
     if not compared:
         return _correction(facts, theme)
     with_heading = len(compared) == 1 and _leaves_the_plane(facts)
@@ -69,7 +69,7 @@ def position_error(facts: RunFacts, theme: Theme) -> Figure | None:
         (robot, errors)
         for robot, errors in facts.compared
         if np.isfinite(errors.corrected_distance).any() or np.isfinite(errors.odometry_distance).any()
-    ][:_MOST_ROBOTS]
+    ][:MOST_ROBOTS]
     if not compared:
         return None
     figure, panels = _column(facts, theme, len(compared))

@@ -219,6 +219,14 @@ def test_a_robot_without_a_reference_lies_beside_the_others(record: RunRecord) -
     np.testing.assert_array_equal(unjoined.corrected, best_position(beta))
 
 
+def test_robots_without_a_panel_of_their_own_are_told(record: RunRecord) -> None:
+    many = replace(record, robots=tuple(replace(record.robots[0], robot=f"robot_{number}") for number in range(7)))
+    section = page_of(RunFacts(many)).sections[1]
+    assert "the first 6 robots" in " ".join(section.text)
+    assert {row.cells[0] for row in section.tables[0].rows} == {f"robot_{number}" for number in range(7)}
+    assert "first 6" not in " ".join(page_of(RunFacts(record)).sections[1].text)
+
+
 def test_an_empty_run(record: RunRecord, tmp_path: Path) -> None:
     empty = replace(record, answer=record.answer.without_content(), robots=(), ticks=(), duration_s=0.0)
     page = Page(write_report(empty, tmp_path))
