@@ -10,7 +10,7 @@ themselves; :func:`gauge_alignment` is the paper's.
 
 from rotavg_ros.metrics.calibration import CalibrationBins, expected_calibration_error
 from rotavg_ros.metrics.orientations import body_from_world, gauge_alignment, orientation_errors, true_edge_noise
-from rotavg_ros.metrics.positions import RigidFit, fit_onto, known_rows, position_errors
+from rotavg_ros.metrics.positions import RigidFit, fit_onto, fits_onto, known_rows, position_errors
 from rotavg_ros.metrics.verdicts import OutlierCounts, roc_area
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "body_from_world",
     "expected_calibration_error",
     "fit_onto",
+    "fits_onto",
     "gauge_alignment",
     "known_rows",
     "orientation_errors",

@@ -42,16 +42,31 @@ def fit_onto(position: FloatArray, reference: FloatArray) -> RigidFit | None:
     return RigidFit(Rotation.from_matrix(turn), target_middle - turn @ middle)
 
 
-def position_errors(position: FloatArray, reference: FloatArray) -> FloatArray:
-    """Distance of n positions to the reference after :func:`fit_onto`, ``(n,)`` metres, NaN where unknown.
+def fits_onto(position: FloatArray, reference: FloatArray, component: NDArray[np.int64]) -> dict[int, RigidFit]:
+    """:func:`fit_onto` of each component ``(n,)`` with two common positions, by its number."""
+    fits = {}
+    for number in np.unique(component).tolist():
+        members = component == number
+        fit = fit_onto(position[members], reference[members])
+        if fit is not None:
+            fits[number] = fit
+    return fits
+
+
+def position_errors(
+    position: FloatArray, reference: FloatArray, component: NDArray[np.int64] | None = None
+) -> FloatArray:
+    """Distance of n positions to the reference after :func:`fits_onto`, ``(n,)`` metres, NaN where unknown.
 
     Args:
         position, reference: ``(n, 3)`` metres; NaN rows are unknown.
+        component: ``(n,)``; default one component.
     """
-    fit = fit_onto(position, reference)
-    if fit is None:
-        return np.full(len(position), np.nan)
-    distance: FloatArray = np.linalg.norm(fit(position) - reference, axis=1)
+    component = np.zeros(len(position), dtype=np.int64) if component is None else component
+    distance = np.full(len(position), np.nan)
+    for number, fit in fits_onto(position, reference, component).items():
+        members = component == number
+        distance[members] = np.linalg.norm(fit(position[members]) - reference[members], axis=1)
     return distance
 
 

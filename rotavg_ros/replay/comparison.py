@@ -113,6 +113,9 @@ class RobotComparison:
 def compare(robot: RobotRecord, component: NDArray[np.int64]) -> RobotComparison | None:
     """Compare a robot's run with its reference; None if there is none, or if it covers no keyframe.
 
+    Each component is laid onto the reference by itself, in the answer and in odometry alike. So where nothing was
+    corrected, nothing differs.
+
     Args:
         component: ``(n,)`` the components of the robot's keyframes.
     """
@@ -125,11 +128,11 @@ def compare(robot: RobotRecord, component: NDArray[np.int64]) -> RobotComparison
     def distance(position: FloatArray | None) -> FloatArray:
         if position is None or truth.position is None:
             return np.full(len(robot.stamp_ns), np.nan)
-        return position_errors(position, truth.position)
+        return position_errors(position, truth.position, component)
 
     return RobotComparison(
         truth=truth,
-        odometry=errors_of_orientations(robot.odometry_world_from_body, truth),
+        odometry=errors_of_orientations(robot.odometry_world_from_body, truth, component),
         corrected=errors_of_orientations(robot.world_from_body, truth, component),
         odometry_distance=distance(robot.odometry_position),
         dead_reckoned_distance=distance(robot.position_dead_reckoned),

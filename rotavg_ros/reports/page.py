@@ -178,7 +178,7 @@ def _trajectory(facts: RunFacts) -> Section:
     else:
         text.append(
             "Odometry and the corrected trajectory are each laid onto the reference as a whole, by one rotation and "
-            "one shift, without scaling (as evo_ape --align does)."
+            "one shift, without scaling (as evo_ape --align does; per connected part of the graph)."
         )
         if alone := [track.robot for track in tracks_of(facts) if track.reference is None]:
             text.append(

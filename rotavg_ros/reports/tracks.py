@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.metrics import RigidFit, fit_onto
+from rotavg_ros.metrics import RigidFit, fits_onto
 from rotavg_ros.replay.comparison import RobotComparison
 from rotavg_ros.replay.record import RobotRecord
 from rotavg_ros.reports.facts import RunFacts
 
 FloatArray = NDArray[np.float64]
+
+_UNMOVED = RigidFit(Rotation.identity(), np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -44,40 +44,33 @@ class Tracks:
 def tracks_of(facts: RunFacts) -> list[Tracks]:
     """The tracks of all robots that have positions.
 
-    A robot without a reference of its own lies beside the others as in the answer: it is moved as one of those is that
-    has a reference, and that edges join with it.
+    A robot without a reference of its own lies beside the others as in the answer: its components are moved as those of
+    a robot that has a reference.
     """
-    robots = facts.record.robots
-    laid = [_onto_reference(*each) for each in zip(robots, facts.comparisons, strict=True)]
-    fits = [None if on is None else on.fit for on in laid]
+    robots, component = facts.record.robots, facts.record.answer.component
+    own = [_onto_reference(*each, facts) for each in zip(robots, facts.comparisons, strict=True)]
+    joint: dict[int, RigidFit] = {}
+    for fits in reversed(own):
+        joint |= fits
     return [
-        _lay_together(robot, on or _Laid(_of_a_joined_robot(facts, robot, fits)), facts.time(robot.stamp_ns))
-        for robot, on in zip(robots, laid, strict=True)
+        _lay_together(
+            robot,
+            fits or {number: joint[number] for number in np.unique(component[robot.nodes]).tolist() if number in joint},
+            comparison.truth.position if comparison is not None and fits else None,
+            facts,
+        )
+        for robot, fits, comparison in zip(robots, own, facts.comparisons, strict=True)
         if best_position(robot) is not None
     ]
 
 
-class _Laid(NamedTuple):
-    """How a robot's corrected positions are moved, None: not at all, and onto which positions of its own reference."""
-
-    fit: RigidFit | None
-    truth: FloatArray | None = None
-
-
-def _onto_reference(robot: RobotRecord, comparison: RobotComparison | None) -> _Laid | None:
-    """None without a reference that has at least two of the robot's positions."""
+def _onto_reference(robot: RobotRecord, comparison: RobotComparison | None, facts: RunFacts) -> dict[int, RigidFit]:
+    """Of each component that has two positions in the robot's own reference."""
     corrected = best_position(robot)
     truth = None if comparison is None else comparison.truth.position
-    fit = None if truth is None or corrected is None else fit_onto(corrected, truth)
-    return None if fit is None else _Laid(fit, truth)
-
-
-def _of_a_joined_robot(facts: RunFacts, robot: RobotRecord, fits: Sequence[RigidFit | None]) -> RigidFit | None:
-    component = facts.record.answer.component
-    for other, fit in zip(facts.record.robots, fits, strict=True):
-        if fit is not None and np.isin(component[robot.nodes], component[other.nodes]).any():
-            return fit
-    return None
+    if corrected is None or truth is None:
+        return {}
+    return fits_onto(corrected, truth, facts.record.answer.component[robot.nodes])
 
 
 def node_positions(facts: RunFacts) -> FloatArray:
@@ -103,24 +96,38 @@ def best_position(robot: RobotRecord) -> FloatArray | None:
     return robot.position if robot.position is not None else robot.position_dead_reckoned
 
 
-def _lay_together(robot: RobotRecord, laid: _Laid, time: FloatArray) -> Tracks:
-    """Align odometry with the reference, too, as well as possible; without one it starts where the answer does."""
+def _lay_together(robot: RobotRecord, fits: dict[int, RigidFit], truth: FloatArray | None, facts: RunFacts) -> Tracks:
+    """Align odometry with the reference, too, as well as possible; without one it starts where the answer does.
+
+    Args:
+        fits: of the corrected components; others are moved as the first of these is.
+        truth: positions of the robot's own reference, onto which its components are laid.
+    """
     corrected, odometry = best_position(robot), robot.odometry_position
     assert corrected is not None
-    fit = laid.fit or RigidFit(Rotation.identity(), np.zeros(3))
+    component = facts.record.answer.component[robot.nodes]
+    before = None
     if odometry is not None:
-        onto_truth = None if laid.truth is None else fit_onto(odometry, laid.truth)
-        odometry = (
-            fit(_same_start(robot, odometry, corrected)(odometry)) if onto_truth is None else onto_truth(odometry)
-        )
-    return Tracks(robot=robot.robot, time=time, odometry=odometry, corrected=fit(corrected), reference=laid.truth)
+        before = _moved(_same_start(robot, odometry, corrected)(odometry), component, fits)
+        for number, fit in ({} if truth is None else fits_onto(odometry, truth, component)).items():
+            before[component == number] = fit(odometry[component == number])
+    after = _moved(corrected, component, fits)
+    return Tracks(robot.robot, facts.time(robot.stamp_ns), before, after, truth)
+
+
+def _moved(position: FloatArray, component: NDArray[np.int64], fits: dict[int, RigidFit]) -> FloatArray:
+    """Each component by its own fit, others by the first one."""
+    moved = next(iter(fits.values()), _UNMOVED)(position)
+    for number, fit in fits.items():
+        moved[component == number] = fit(position[component == number])
+    return moved
 
 
 def _same_start(robot: RobotRecord, odometry: FloatArray, corrected: FloatArray) -> RigidFit:
     known = np.isfinite(odometry).all(axis=1) & np.isfinite(corrected).all(axis=1)
     known &= np.isfinite(robot.odometry_world_from_body).all(axis=1)
     if not known.any():
-        return RigidFit(Rotation.identity(), np.zeros(3))
+        return _UNMOVED
     first = int(np.argmax(known))
     before, after = robot.odometry_world_from_body[first], robot.world_from_body[first]
     turn = Rotation.from_quat(after) * Rotation.from_quat(before).inv()

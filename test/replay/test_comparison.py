@@ -50,6 +50,40 @@ def test_every_trajectory_is_compared_by_itself() -> None:
     assert comparison.corrected.angle.max() < 1e-6 < comparison.odometry.angle.mean()
 
 
+def test_what_is_not_corrected_has_the_errors_of_odometry_whatever_its_parts_frames() -> None:
+    record = robot()
+    assert record.odometry_position is not None
+    component = np.repeat([0, 1], COUNT // 2)
+    begun_anew = Rotation.from_euler("z", 2.0 * component[:, None])
+    orientation, position = Rotation.from_quat(record.odometry_world_from_body), record.odometry_position
+    odometry = replace(
+        record,
+        odometry_world_from_body=(begun_anew * orientation).as_quat(),
+        odometry_position=begun_anew.apply(position) + 30.0 * component[:, None],
+        world_from_body=record.odometry_world_from_body,
+        position=position,
+    )
+    comparison = compare(odometry, component)
+    assert comparison is not None
+    np.testing.assert_allclose(comparison.odometry.angle, comparison.corrected.angle, atol=1e-9)
+    np.testing.assert_allclose(comparison.odometry_distance, comparison.corrected_distance, atol=1e-9)
+    for part in (component == 0, component == 1):
+        alone = compare(
+            replace(
+                odometry,
+                stamp_ns=odometry.stamp_ns[part],
+                time_line=odometry.time_line[part],
+                odometry_world_from_body=odometry.odometry_world_from_body[part],
+                odometry_position=position[part],
+                world_from_body=odometry.world_from_body[part],
+                position=position[part],
+            ),
+            component[part],
+        )
+        assert alone is not None
+        np.testing.assert_allclose(comparison.corrected_distance[part], alone.corrected_distance, atol=1e-9)
+
+
 def test_orientation_and_heading_errors() -> None:
     rng = np.random.default_rng(0)
     true = Rotation.random(200, rng=rng)
