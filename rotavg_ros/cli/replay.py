@@ -17,7 +17,7 @@ from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.replay.options import read_parameter_file, read_settings
 from rotavg_ros.replay.plan import Plan, Wishes, make_plan
 from rotavg_ros.replay.run import Window
-from rotavg_ros.wording import counted
+from rotavg_ros.wording import counted, unless_nearly_all
 
 # Number of ticks and duration from which a hint on how to make it faster is shown.
 _MANY_TICKS, _LONG_SECONDS = 500, 60.0
@@ -155,7 +155,7 @@ def _told(summary: dict[str, Any], output: Path) -> str:
     if summary["ticks"] > _MANY_TICKS and summary["wall_seconds"] > _LONG_SECONDS:
         lines.append(f"most of the time went into {summary['ticks']} solves; -p solve_period_s:=5.0 makes fewer")
     for robot, said in summary["robots"].items():
-        if "orientation_error_mean_deg" in said:
+        if "reference" in said:
             lines.append(_compared(robot, said))
     counts = (
         f"{counted(summary['keyframes'], 'keyframe')}, {counted(summary['loop_closures'], 'loop closure')}, "
@@ -168,8 +168,12 @@ def _told(summary: dict[str, Any], output: Path) -> str:
 
 
 def _compared(robot: str, said: dict[str, Any]) -> str:
+    known, keyframes = said["compared_keyframes"], said["keyframes"]
+    if not known:
+        return f"{robot} against {said['reference']}: not compared, for it has nothing within 0.15 s of any keyframe"
+    where = unless_nearly_all(known, keyframes, "keyframes")
     degrees = said["orientation_error_mean_deg"]
-    line = f"{robot} against {said['reference']}: orientation {_arrow(degrees, '°')} in the mean"
+    line = f"{robot} against {said['reference']}{where}: orientation {_arrow(degrees, '°')} in the mean"
     metres = said.get("position_error_rms_m")
     return line if metres is None else f"{line}, position {_arrow(metres, ' m')} RMS"
 

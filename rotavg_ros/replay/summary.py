@@ -58,10 +58,13 @@ def summarize(record: RunRecord, bag: Path, outcome: Outcome) -> dict[str, Any]:
 
 def _robot(robot: RobotRecord, component: NDArray[np.int64]) -> dict[str, Any]:
     said: dict[str, Any] = {"keyframes": len(robot.nodes)}
-    comparison = compare(robot, component)
-    if robot.reference is None or comparison is None:
+    if robot.reference is None:
         return said
+    comparison = compare(robot, component)
     said["reference"] = robot.reference.name
+    said["compared_keyframes"] = 0 if comparison is None else int(np.isfinite(comparison.corrected.angle).sum())
+    if comparison is None:
+        return said
     said["orientation_error_mean_deg"] = {
         "odometry": _mean_deg(comparison.odometry.angle),
         "corrected": _mean_deg(comparison.corrected.angle),

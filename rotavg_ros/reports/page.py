@@ -22,10 +22,9 @@ from rotavg_ros.reports.tables import (
 from rotavg_ros.reports.time_pictures import MOST_ROBOTS
 from rotavg_ros.reports.tracks import tracks_of
 from rotavg_ros.view_graph import FALSE_CLOSURE_M
-from rotavg_ros.wording import counted
+from rotavg_ros.wording import counted, unless_nearly_all
 
 MOST_CLOSURES = 40  # in the table that is not folded; edges.csv has all
-_NEARLY_ALL = 0.9
 
 
 @dataclass(frozen=True)
@@ -140,7 +139,7 @@ def _where_known(facts: RunFacts) -> str:
     """Words on the number of keyframes with a reference; empty if nearly all have one."""
     known = sum(int(np.isfinite(errors.corrected.angle).sum()) for _, errors in facts.compared)
     total = sum(len(robot.stamp_ns) for robot, _ in facts.compared)
-    return "" if known > _NEARLY_ALL * total else f" at {known} of {total} keyframes"
+    return unless_nearly_all(known, total, "keyframes")
 
 
 def _notes(facts: RunFacts) -> list[str]:

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -262,6 +262,27 @@ def test_a_reference_that_loses_its_position_now_and_then(tmp_path: Path) -> Non
     assert main(["replay", str(tmp_path / "bag"), "--output", str(tmp_path / "out")]) == 0
     (said,) = json.loads((tmp_path / "out" / "summary.json").read_text())["robots"].values()
     assert said["position_error_rms_m"]["odometry"] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "known", "told"),
+    [
+        ((12.0, 13.0, 14.0), 3, "against few.tum at 3 of {} keyframes: orientation 0.00°"),
+        ((12.5, 13.5), 0, "against few.tum: not compared, for it has nothing within 0.15 s of any keyframe"),
+        (range(1, 51), None, "against few.tum: orientation 0.00°"),
+    ],
+)
+def test_a_reference_of_few_keyframes_is_told_to_be_that(
+    stamps: Iterable[float], known: int | None, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag, reference = make_bag(tmp_path / "bag", period_ns=10**9), tmp_path / "few.tum"
+    reference.write_text("".join(f"{stamp} {0.1 * (stamp - 1)} 0 0 0 0 0 1\n" for stamp in stamps))
+    often = ["-p", "keyframe_distance_m:=0.05", "--no-report"]
+    assert main(["replay", str(bag), "--output", str(tmp_path / "out"), "--reference", str(reference), *often]) == 0
+    (said,) = json.loads((tmp_path / "out" / "summary.json").read_text())["robots"].values()
+    assert said["keyframes"] > 40
+    assert said["compared_keyframes"] == (said["keyframes"] if known is None else known)
+    assert told.format(said["keyframes"]) in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
