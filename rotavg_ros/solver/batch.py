@@ -11,7 +11,7 @@ import torch
 
 from rotavg_ros.solver import warnings
 from rotavg_ros.solver.methods import NETWORK_METHODS
-from rotavg_ros.solver.pipeline import solve
+from rotavg_ros.solver.pipeline import OUTLIER_ANGLE, solve
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import HoldsViewGraph, ViewGraph, view_graph_of
 
@@ -30,9 +30,9 @@ def solve_batch(
     SfM graphs are solved together as one graph with that many components, and ``stage_seconds`` are those of all. The
     linear systems are iterated until every component has converged, so answers differ from separate solves by the
     refinement's tolerance: up to a tenth of a standard error where cameras have few edges, 10⁻⁵ rad and less elsewhere.
-    Their ``warnings`` are those about edges that state nothing and about mostly flagged graphs; the warnings that edges
-    which contradict the answer agree among themselves, and that another answer fits nearly as well, are given only for
-    graphs solved alone. SLAM graphs, and methods that are not ours, are solved one by one.
+    Their ``warnings`` are those about edges that state nothing, mostly flagged graphs and accepted edges that are far
+    off; the warnings that edges which contradict the answer agree among themselves, and that another answer fits nearly
+    as well, are given only for graphs solved alone. SLAM graphs, and methods that are not ours, are solved one by one.
 
     Returns:
         a solution per graph, in their order.
@@ -91,7 +91,7 @@ def _split(joint: Solution, graphs: Sequence[ViewGraph]) -> list[Solution]:
     parts = []
     for index, graph in enumerate(graphs):
         nodes, edges = slice(node[index], node[index + 1]), slice(edge[index], edge[index + 1])
-        component = joint.component[nodes]
+        component, on_cpu = joint.component[nodes], graph.to("cpu")
         parts.append(
             Solution(
                 joint.body_from_world[nodes],
@@ -103,8 +103,9 @@ def _split(joint: Solution, graphs: Sequence[ViewGraph]) -> list[Solution]:
                 joint.profile,
                 joint.device,
                 warnings=(
-                    *warnings.stating_nothing(graph.to("cpu")),
-                    *warnings.mostly_flagged(graph.to("cpu"), joint.outlier_score[edges]),
+                    *warnings.stating_nothing(on_cpu),
+                    *warnings.mostly_flagged(on_cpu, joint.outlier_score[edges]),
+                    *warnings.accepted_far_off(on_cpu, joint.body_from_world[nodes], OUTLIER_ANGLE["sfm"]),
                 ),
             )
         )

@@ -28,7 +28,7 @@ from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, EdgeLabel, HoldsViewGraph, ViewGraph, view_graph_of
 
 # The noise that makes an edge an outlier, in radians.
-_OUTLIER_ANGLE = {"sfm": NUMBERS.outlier_angle, "slam": exceedance.OUTLIER_ANGLE}
+OUTLIER_ANGLE = {"sfm": NUMBERS.outlier_angle, "slam": exceedance.OUTLIER_ANGLE}
 # With fewer edges, two passes over them take less time than waking another worker.
 _WORTH_WORKERS = 50_000
 
@@ -123,7 +123,7 @@ def solve(
             *estimate.warnings,
             *stating_nothing,
             *warnings.mostly_flagged(graph, score, rotation_score, estimate.restated),
-            *(warnings.accepted_far_off(graph, orientations, NUMBERS.outlier_angle) if profile == "sfm" else ()),
+            *(warnings.accepted_far_off(graph, orientations, OUTLIER_ANGLE["sfm"]) if profile == "sfm" else ()),
         ),
         None if places is None else _root_at_origin(places.position, estimate.body_from_world, job.component),
         None if places is None else places.variance.sqrt(),
@@ -271,7 +271,7 @@ def _solve_baseline(job: _Job, name: str, run: Run) -> Estimate:
         graph = replace(graph, kind=torch.full_like(graph.kind, EdgeKind.LOOP_CLOSURE))
     with run.watch.stage(name):
         orientations = baselines.BASELINES[name](graph, run.warm_start)
-    score = baselines.residual_score(graph, orientations, _OUTLIER_ANGLE[job.profile])
+    score = baselines.residual_score(graph, orientations, OUTLIER_ANGLE[job.profile])
     return Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros import EdgeLabel, ViewGraph, rotations, solve
+from rotavg_ros import EdgeLabel, ViewGraph, rotations, solve, solve_batch
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
 from rotavg_ros.metrics import orientation_errors
 from test.solver.graphs import as_quaternions, random_truth, small_noise
@@ -143,3 +143,5 @@ def test_accepted_edges_that_contradict_each_other_are_told() -> None:
     (warning,) = solve(accepting(graph, torch.ones(3, dtype=torch.bool))).warnings
     assert warning.startswith("3 of 3 accepted edges are more than 20° off in the answer, up to 29°")
     assert solve(accepting(triangle(0.1), torch.ones(3, dtype=torch.bool))).warnings == ()
+    (first, second) = solve_batch([accepting(each, torch.ones(3, dtype=torch.bool)) for each in (graph, triangle(0.1))])
+    assert (first.warnings, second.warnings) == ((warning,), ())
