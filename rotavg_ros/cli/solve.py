@@ -29,7 +29,7 @@ from rotavg_ros.solver import Solution, methods, solve
 from rotavg_ros.solver.solution import residual_deg, residual_m
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
-from rotavg_ros.wording import counted
+from rotavg_ros.wording import counted, with_names
 
 OUTLIER_THRESHOLD = 0.5
 _ORIENTATIONS, _EDGES, _SUMMARY = "orientations.csv", "edges", "summary.json"
@@ -201,7 +201,7 @@ def summarize(
         "loop_closures": int(is_closure.sum()),
         "outliers": int(outlier.sum()),
         "flagged_closures": int((outlier & is_closure).sum()),
-        "warnings": list(solution.warnings),
+        "warnings": list(with_names(solution.warnings, lambda row: int(graph_file.node_ids[row]))),
         "skipped": graph_file.skipped,
         "stage_seconds": solution.stage_seconds,
         "read_seconds": read_seconds,

@@ -36,7 +36,8 @@ class Solution:
         edge_precision: ``(M, 2)`` rad⁻² and m⁻² per component, weights of the edges in the answer, 0 where a
             translation is unknown and for closures that are made of odometry; copies of a measurement share its
             weight; None likewise.
-        warnings: reasons not to trust the answer, one sentence each: what was seen, a possible cause, what to do.
+        warnings: reasons not to trust the answer, one sentence each: what was seen, a possible cause, what to do. Nodes
+            in them are rows of the graph.
         step_deviation: radians, standard deviation of each component of a step of odometry; NaN where the method does
             not estimate it.
         work: units of work that the solve took, :data:`~rotavg_ros.solver.SECONDS_PER_UNIT` each; counted for robots'

@@ -15,6 +15,7 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from scipy.spatial.transform import Rotation
 
 from rotavg_ros import rotations, solve
 from rotavg_ros.cli.main import main
@@ -118,6 +119,20 @@ def test_warnings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["solve", str(path), "--output", str(out)]) == 0
     assert capsys.readouterr().err == ""
     assert json.loads((out / "summary.json").read_text())["warnings"] == []
+
+
+def test_warnings_name_nodes_by_their_ids(tmp_path: Path) -> None:
+    """Two odometries between nodes 5000, 5007 …, of which one slips by 57° in the step after node 5140."""
+    rng, path = np.random.default_rng(0), tmp_path / "run.npz"
+    true = Rotation.from_rotvec(0.3 * rng.normal(size=(39, 3)))
+    wheels, camera = (true * Rotation.from_rotvec(0.01 * rng.normal(size=(39, 3))) for _ in range(2))
+    slip = Rotation.from_rotvec(np.where(np.arange(39)[:, None] == 20, [0.0, 0.0, 1.0], 0.0))
+    first = 5000 + 7 * np.tile(np.arange(39), 2)
+    relative = np.concatenate([wheels.as_quat(), (slip * camera).as_quat()])
+    np.savez(path, source=first, target=first + 7, target_from_source=relative, kind=np.zeros(78, dtype=int))
+    assert main(["solve", str(path), "--output", str(tmp_path / "out")]) == 0
+    (warning,) = json.loads((tmp_path / "out" / "summary.json").read_text())["warnings"]
+    assert "(between nodes 5140 and 5147): " in warning
 
 
 def test_components_lone_nodes_and_skipped_lines(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from rotavg_ros.online.answer.gauge import component_roots
 from rotavg_ros.online.graph.snapshot import GraphSnapshot
 from rotavg_ros.solver.solution import angles_off, distances_off
 from rotavg_ros.view_graph import EdgeLabel
+from rotavg_ros.wording import with_names
 
 if TYPE_CHECKING:
     from rotavg_ros.solver import Solution
@@ -143,7 +144,7 @@ class Answer:
             method=solution.method,
             profile=solution.profile,
             device=solution.device,
-            warnings=solution.warnings,
+            warnings=with_names(solution.warnings, snapshot.keyframe_name),
             position=_in_gauge(solution, body_from_world),
             position_uncertainty=_numbers(solution.position_uncertainty),
             rotation_score=_numbers(solution.rotation_score),

@@ -68,3 +68,8 @@ class GraphSnapshot:
     translation: NDArray[np.float64]
     marginalized: MarginalizedIndex
     revision: int
+
+    def keyframe_name(self, row: int) -> str:
+        """A keyframe's id as its sender knows it, after its robot's name where there are several."""
+        number = str(int(self.keyframe_id[row]))
+        return number if len(self.robots) == 1 else f"{self.robots[int(self.keyframe_robot[row])]} {number}"

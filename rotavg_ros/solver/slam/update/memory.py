@@ -35,6 +35,7 @@ from rotavg_ros.solver.slam.update.columns import Columns
 from rotavg_ros.solver.slam.update.grown_edges import begins_with, thinned_out
 from rotavg_ros.solver.slam.update.labelled import UNKNOWN, Labelled, solved_from
 from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.wording import without_rows
 
 # The whole search is due once unexplained closures exceed the first share of those in the last search, or new ones
 # exceed the second; if another answer was nearly as likely, with any new closure.
@@ -228,7 +229,8 @@ class SlamMemory:
             return None
         share = int((~graph.is_odometry).sum()) / max(int((~odometry).sum()), 1)
         searched, unexplained = (round(min(share, 1.0) * count) for count in (self.searched, self.unexplained))
-        before = replace(self, graph=graph, trusted=trusted, searched=searched, unexplained=unexplained)
+        told = None if self.warnings is None else without_rows(self.warnings)
+        before = replace(self, graph=graph, trusted=trusted, searched=searched, unexplained=unexplained, warnings=told)
         return replace(before, ahead=None, anew=False, update=None, columns=None)
 
     def updated(

@@ -19,6 +19,7 @@ from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.labels.prior import log_slip_prior
 from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.wording import between_nodes
 
 # Maximum number of shifts that are examined, those proposed by the closures of largest gain first; and number of these
 # for which displaced stretches are examined as well.
@@ -140,6 +141,6 @@ def jump_warnings(pose: PoseMode) -> tuple[str, ...]:
     times = "once" if len(jumped) == 1 else f"{len(jumped)} times"
     return (
         f"Odometry's position seems to have jumped {times} while its heading did not, by up to {far[largest]:.1f} m "
-        f"(between nodes {first} and {last}): closures on both sides agree on that. Wheels may have spun, or a tracker "
+        f"({between_nodes(first, last)}): closures on both sides agree on that. Wheels may have spun, or a tracker "
         "may have been lost.",
     )

@@ -8,6 +8,7 @@ import torch
 from rotavg_ros import rotations
 from rotavg_ros.solver.slam.posterior.left_out import slipped_or_tailed
 from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.wording import between_nodes
 
 # Slips of more than this, rad, are reported.
 _FAR_SLIP = np.radians(10.0)
@@ -34,8 +35,8 @@ def _of_slips(mode: Mode) -> tuple[str, ...]:
     first, last = sorted((int(graph.nodes[graph.source[largest]]), int(graph.nodes[graph.target[largest]])))
     times = "once" if len(far) == 1 else f"{len(far)} times"
     slipped = (
-        f"Odometry seems to have slipped {times}, by up to {np.degrees(turned.max()):.0f}° (between nodes {first} and "
-        f"{last})"
+        f"Odometry seems to have slipped {times}, by up to {np.degrees(turned.max()):.0f}° "
+        f"({between_nodes(first, last)})"
     )
     if bool(graph.is_odometry.all()):
         return (f"{slipped}: other odometry between the same nodes disagrees with it, so one of the two is wrong.",)
