@@ -159,7 +159,7 @@ def _notes(facts: RunFacts) -> list[str]:
             "within itself."
         )
     warnings = (*record.warnings, *record.answer.warnings)
-    notes += [f"{warning[:1].upper()}{warning[1:]}." for warning in warnings]
+    notes += [f"{warning[:1].upper()}{warning[1:].removesuffix('.')}." for warning in warnings]
     if facts.num_flagged_odometry:
         count = counted(facts.num_flagged_odometry, "odometry edge")
         notes.append(f"{count} contradict the rest of the graph: a slip, a jump, or a wrong stamp.")

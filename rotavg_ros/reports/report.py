@@ -58,7 +58,8 @@ PICTURES = (
         "uncertainty",
         time_pictures.uncertainty,
         "Uncertainty of the orientations over time",
-        "One standard deviation relative to the first keyframe. It grows along odometry and falls at loop closures.",
+        "One standard deviation about each axis, relative to the first keyframe of the connected part. It grows along "
+        "odometry and falls at loop closures.",
     ),
     Picture(
         "graph",

@@ -130,7 +130,7 @@ def error_table(facts: RunFacts) -> Table:
         for what, values, factor, unit in (
             ("orientation, odometry alone", errors.odometry.angle, np.degrees(1.0), "°"),
             ("orientation, corrected", errors.corrected.angle, np.degrees(1.0), "°"),
-            ("… one standard deviation as stated", robot.uncertainty, np.degrees(1.0), "°"),
+            ("… one standard deviation about each axis, as stated", robot.uncertainty, np.degrees(1.0), "°"),
             ("position, odometry alone", errors.odometry_distance, 1.0, " m"),
             ("position, odometry's steps along corrected orientations", errors.dead_reckoned_distance, 1.0, " m"),
             ("position, corrected", errors.corrected_distance, 1.0, " m"),

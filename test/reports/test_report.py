@@ -178,9 +178,12 @@ def test_a_page_says_what_is_missing(record: RunRecord, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("few_pictures")
 def test_warnings_stand_above_all_results(record: RunRecord, tmp_path: Path) -> None:
-    warned = replace(record, answer=replace(record.answer, warnings=("closures <may> be inverted: invert them",)))
+    warned = replace(
+        record, answer=replace(record.answer, warnings=("closures <may> be inverted: invert them", "A slip. Or not."))
+    )
     text = Page(write_report(warned, tmp_path)).text
     assert "Closures <may> be inverted: invert them." in text
+    assert "A slip. Or not." in text and ".." not in text
     assert text.index("Closures <may> be") < text.index("Odometry and the corrected trajectory")
 
 
