@@ -134,7 +134,7 @@ def _own_graph(bag: Path, arguments: argparse.Namespace) -> _Scene:
         odometry_position=position,
         true_world_from_body=None if truth is None else truth * [-1, -1, -1, 1],
         true_position=graph_file.position_gt,
-        edge_is_false=edge_is_false(graph, truth),
+        edge_is_false=edge_is_false(graph, truth, graph_file.position_gt),
     )
     description = f"{graph.num_nodes} keyframes, {int(is_closure.sum())} loop closures"
     return _Scene(arguments.graph.name, description, run, is_closure, {"keyframe_source": "edges"})

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rotavg_ros import rotations
 from rotavg_ros.evaluation.live.node_answer import NodeAnswer
 from rotavg_ros.metrics import (
     OutlierCounts,
@@ -18,7 +19,7 @@ from rotavg_ros.metrics import (
     orientation_errors,
     true_edge_noise,
 )
-from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, EdgeKind, ViewGraph
+from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, FALSE_CLOSURE_M, EdgeKind, ViewGraph
 
 FloatArray = NDArray[np.floating]
 
@@ -46,13 +47,26 @@ class PlayedRun:
     edge_is_false: FloatArray
 
 
-def edge_is_false(graph: ViewGraph, true_body_from_world: FloatArray | None) -> FloatArray:
-    """``(M,)`` 1 where a closure's noise exceeds 10°, 0 where not, NaN where the truth is unknown."""
+def edge_is_false(
+    graph: ViewGraph, true_body_from_world: FloatArray | None, true_position: FloatArray | None = None
+) -> FloatArray:
+    """``(M,)`` 1 where an edge's rotation errs by more than 10° or its translation by more than 2 m, 0 where not.
+
+    NaN where the truth is unknown. Without a translation, or true positions at all, the rotation alone is judged.
+    """
     if true_body_from_world is None:
         return np.full(graph.num_edges, np.nan)
     truth = torch.from_numpy(true_body_from_world)
     noise = true_edge_noise(graph, truth).numpy()
-    return np.where(np.isnan(noise), np.nan, noise > _FALSE_CLOSURE_RAD)
+    is_turned = np.where(np.isnan(noise), np.nan, noise > _FALSE_CLOSURE_RAD)
+    if graph.translation is None or true_position is None:
+        return is_turned
+    position = torch.from_numpy(true_position)
+    shift = rotations.rotate(truth[graph.source], position[graph.target] - position[graph.source])
+    off = (shift - graph.translation).norm(dim=1).numpy()
+    is_elsewhere = np.where(np.isnan(off), np.nan, off > FALSE_CLOSURE_M)
+    judged = np.where(is_turned == 1, 1.0, np.maximum(is_turned, is_elsewhere))
+    return np.where(graph.translation.isfinite().all(dim=1).numpy(), judged, is_turned)
 
 
 @dataclass(frozen=True)
@@ -134,7 +148,7 @@ def judge(answer: NodeAnswer, run: PlayedRun, is_closure: NDArray[np.bool_]) -> 
         true_position=true_position,
         odometry_position=odometry_position,
         corrected_position=corrected_position,
-        odometry_error=_errors(odometry, truth),
+        odometry_error=_errors(odometry, truth, answer.component),
         corrected_error=_errors(answer.world_from_body, truth, answer.component),
         closure_ends=ends,
         closure_score=answer.score[closures],

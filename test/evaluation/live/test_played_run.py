@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -74,6 +76,27 @@ def test_a_perfect_answer(simulated: SimulatedRun, by_id: bool) -> None:
     drift = np.linalg.norm(report.odometry_position - report.true_position, axis=1)
     assert off.max() < 2
     assert off.max() < drift.max() / 2
+
+
+def test_a_closure_is_false_by_its_place_as_well(simulated: SimulatedRun) -> None:
+    graph_file = simulated.to_graph_file()
+    graph, truth = simulated.graph, graph_file.body_from_world_gt
+    turn = Rotation.from_quat(simulated.world_from_body)
+    source, target = graph.source.numpy(), graph.target.numpy()
+    translation = turn[source].inv().apply(simulated.position[target] - simulated.position[source])
+    by_rotation = edge_is_false(graph, truth)
+    good, turned = (np.flatnonzero(by_rotation == value) for value in (0, 1))
+    translation[good[0]] += [0.0, 3.0, 0.0]
+    translation[good[1]] += [0.0, 1.0, 0.0]
+    translation[good[2]] = translation[turned[0]] = np.nan
+    position = simulated.position.copy()
+    position[target[good[3]]] = np.nan
+    placed = replace(graph, translation=torch.from_numpy(translation))
+    judged = edge_is_false(placed, truth, position)
+    assert judged[good[:4]].tolist()[:3] == [1, 0, 0] and np.isnan(judged[good[3]])
+    assert (judged[turned] == 1).all()
+    np.testing.assert_array_equal(edge_is_false(graph, truth, position), by_rotation)
+    np.testing.assert_array_equal(edge_is_false(placed, truth), by_rotation)
 
 
 def test_closures_connect_the_right_keyframes(simulated: SimulatedRun) -> None:
