@@ -27,11 +27,10 @@ def draw(report: LiveReport, path: Path, title: str) -> None:
     figure.text(0.03, 0.95, heading, fontsize=17, fontweight="bold", color=LIGHT.ink, va="center", parse_math=False)
     figure.text(0.03, 0.907, _subtitle(report), fontsize=11, color=LIGHT.muted, va="center")
     _draw_map(figure.add_subplot(grid[:, 0]), report)
-    if report.knows_errors:
-        _draw_errors(figure.add_subplot(grid[0, 1]), report)
-        _draw_scores(figure.add_subplot(grid[1, 1]), report)
-    else:
-        _draw_scores(figure.add_subplot(grid[:, 1]), report)
+    right = [_draw_errors] if report.knows_errors else []
+    right += [_draw_scores] if len(report.closure_score) else []
+    for row, draw_panel in enumerate(right):
+        draw_panel(figure.add_subplot(grid[row, 1] if len(right) == 2 else grid[:, 1]), report)
     figure.savefig(path)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -124,3 +125,23 @@ def test_the_picture(simulated: SimulatedRun, tmp_path: Path) -> None:
     with Image.open(tmp_path / "picture.png") as image:
         assert image.size == (2100, 1200)
         assert len(image.convert("RGB").getcolors(1 << 24)) > 100
+
+
+@pytest.mark.parametrize(("truth", "closures", "panels"), [(True, True, 3), (True, False, 2), (False, False, 1)])
+def test_the_picture_has_no_empty_panel(
+    simulated: SimulatedRun,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    truth: bool,
+    closures: bool,
+    panels: int,
+) -> None:
+    answer, figures = perfect_answer(simulated), []
+    if not closures:
+        none = {name: getattr(answer, name)[:0] for name in ("edge_ids", "source_ids", "target_ids", "kind")}
+        answer = replace(answer, **none, score=answer.score[:0], is_outlier=answer.is_outlier[:0])
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    draw(judge(answer, played(simulated, truth=truth), ~simulated.graph.is_odometry.numpy()), tmp_path / "a.png", "")
+    (figure,) = figures
+    assert len(figure.axes) == panels
+    assert all(axes.has_data() for axes in figure.axes)
