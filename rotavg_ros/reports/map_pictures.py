@@ -12,7 +12,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from rotavg_ros.reports.facts import RunFacts
-from rotavg_ros.reports.panels import DASHED, View, score_bar, segments, square_map, track
+from rotavg_ros.reports.panels import DASHED, View, gaps_between, score_bar, segments, square_map, track
 from rotavg_ros.reports.theme import WIDTH, Theme, plain
 from rotavg_ros.reports.tracks import Tracks, node_positions, tracks_of
 
@@ -40,7 +40,8 @@ def trajectory(facts: RunFacts, theme: Theme) -> Figure | None:
     else:
         top, bottom = figure.subplots(2, 1, gridspec_kw={"height_ratios": (3, 1)})
         for time, position, line in lines:
-            bottom.plot(time, position[:, view.hidden], **line)
+            lines_of_time = np.cumsum(np.diff(time, prepend=time[:1]) < 0, dtype=np.int64)  # a clock may have gone back
+            bottom.plot(*gaps_between(lines_of_time, time, position[:, view.hidden]), **line)
         bottom.margins(x=0.01)
         theme.dress(bottom, "", facts.clock.unit, view.name(view.hidden))
     for _, position, line in lines:

@@ -119,28 +119,38 @@ def counts_over_time(axes: Axes, time: FloatArray, curves: Mapping[str, tuple[Se
     axes.yaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
 
 
+def gaps_between(time_line: NDArray[np.int64], *rows: FloatArray) -> tuple[FloatArray, ...]:
+    """Each of several ``(n, …)`` arrays with a row of NaN where a new one of ``(n,)`` ascending time lines begins."""
+    begins = np.flatnonzero(np.diff(time_line)) + 1
+    return tuple(np.insert(np.asarray(each, dtype=np.float64), begins, np.nan, axis=0) for each in rows)
+
+
 def over_time(
     axes: Axes,
     time: FloatArray,
     curves: Curves,
     unit: str,
     *,
+    time_line: NDArray[np.int64] | None = None,
     from_zero: bool = True,
 ) -> None:
     """Curves over times in any order; unknown values are left out. Called again, it adds to what is drawn.
 
     Args:
         unit: appended to the numbers on the axis.
+        time_line: of each time, where a clock went back; each has a line of its own. Default: one.
         from_zero: whether the axis begins at zero and the area below a curve is tinted.
     """
-    order = np.argsort(time, kind="stable")
+    line = np.zeros(len(time), dtype=np.int64) if time_line is None else time_line
+    order = np.lexsort((time, line))
     axes.set_autoscaley_on(True)  # the limit below ends it, and these curves may be higher than earlier ones
     for name, (values, colour) in curves.items():
         known = order[np.isfinite(values[order])]
         look: dict[str, Any] = {"marker": _marker(len(known)), "markersize": 4, "linewidth": 1.4}
-        axes.plot(time[known], values[known], color=colour, label=name, **look)
+        x, y = gaps_between(line[known], time[known], values[known])
+        axes.plot(x, y, color=colour, label=name, **look)
         if from_zero:
-            axes.fill_between(time[known], values[known], color=colour, alpha=0.12, linewidth=0)
+            axes.fill_between(x, y, color=colour, alpha=0.12, linewidth=0)
     if from_zero:
         axes.set_ylim(bottom=0)
     axes.margins(x=0.01)

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from rotavg_ros.replay.record import RobotRecord
 from rotavg_ros.reports.facts import RunFacts
 from rotavg_ros.reports.panels import Curves, PlainLogFormatter, counts_over_time, over_time
 from rotavg_ros.reports.theme import WIDTH, Theme, plain
@@ -33,7 +34,7 @@ def orientation(facts: RunFacts, theme: Theme) -> Figure | None:
             _with_mean("odometry alone", before, "°"): (before, theme.odometry),
             _with_mean("corrected", after, "°"): (after, theme.corrected),
         }
-        over_time(axes, facts.time(robot.stamp_ns), curves, "°")
+        over_time(axes, facts.time(robot.stamp_ns), curves, "°", time_line=robot.time_line)
         theme.dress(axes, _of_robot("Orientation error", robot.robot, facts), axes.get_xlabel(), legend_rows=1)
     if with_heading:
         robot, errors = compared[0]
@@ -41,7 +42,8 @@ def orientation(facts: RunFacts, theme: Theme) -> Figure | None:
             "odometry alone": (np.degrees(errors.odometry.heading), theme.odometry),
             "corrected": (np.degrees(errors.corrected.heading), theme.corrected),
         }
-        over_time(panels[-1], facts.time(robot.stamp_ns), headings, "°", from_zero=False)
+        times, lines = facts.time(robot.stamp_ns), robot.time_line
+        over_time(panels[-1], times, headings, "°", time_line=lines, from_zero=False)
         theme.dress(panels[-1], "Heading error, about z", facts.clock.unit)
     return figure
 
@@ -53,8 +55,8 @@ def _leaves_the_plane(facts: RunFacts) -> bool:
 
 
 def _correction(facts: RunFacts, theme: Theme) -> Figure | None:
-    curves: list[tuple[str, FloatArray, FloatArray]] = [
-        (plain(robot.robot), facts.time(robot.stamp_ns), np.degrees(turned))
+    curves = [
+        (robot, np.degrees(turned))
         for robot, turned in zip(facts.record.robots, facts.correction, strict=True)
         if np.isfinite(turned).any()
     ]
@@ -78,7 +80,7 @@ def position_error(facts: RunFacts, theme: Theme) -> Figure | None:
             _with_mean("odometry alone", errors.odometry_distance, " m"): (errors.odometry_distance, theme.odometry),
             _with_mean("corrected", errors.corrected_distance, " m"): (errors.corrected_distance, theme.corrected),
         }
-        over_time(axes, facts.time(robot.stamp_ns), curves, " m")
+        over_time(axes, facts.time(robot.stamp_ns), curves, " m", time_line=robot.time_line)
         theme.dress(axes, _of_robot("Position error", robot.robot, facts), axes.get_xlabel(), legend_rows=1)
     return figure
 
@@ -87,9 +89,7 @@ def uncertainty(facts: RunFacts, theme: Theme) -> Figure | None:
     """One sigma of every keyframe's orientation."""
     answer = facts.record.answer
     curves = [
-        (plain(robot.robot), facts.time(robot.stamp_ns), np.degrees(robot.uncertainty))
-        for robot in facts.record.robots
-        if np.isfinite(robot.uncertainty).any()
+        (robot, np.degrees(robot.uncertainty)) for robot in facts.record.robots if np.isfinite(robot.uncertainty).any()
     ]
     if not curves or len(answer.stamp_ns) == 0:
         return None
@@ -147,12 +147,13 @@ def flips(facts: RunFacts, theme: Theme) -> Figure | None:
 
 
 def _one_line_per_robot(
-    facts: RunFacts, theme: Theme, curves: Sequence[tuple[str, FloatArray, FloatArray]], title: str, unit: str
+    facts: RunFacts, theme: Theme, curves: Sequence[tuple[RobotRecord, FloatArray]], title: str, unit: str
 ) -> Figure:
     figure, (axes,) = _column(facts, theme, 1)
     several = len(curves) > 1
-    for number, (robot, time, values) in enumerate(curves):
-        over_time(axes, time, {robot: (values, theme.robots[number % len(theme.robots)])}, unit)
+    for number, (robot, values) in enumerate(curves):
+        curve = {plain(robot.robot): (values, theme.robots[number % len(theme.robots)])}
+        over_time(axes, facts.time(robot.stamp_ns), curve, unit, time_line=robot.time_line)
     theme.dress(axes, title, facts.clock.unit, legend_rows=-(-len(curves) // 4) if several else 0)
     return figure
 

@@ -21,11 +21,12 @@ from rotavg_ros.online import Answer, RejectReason
 from rotavg_ros.replay.record import RunRecord, TopicUse
 from rotavg_ros.reports import ReportError, report, write_report
 from rotavg_ros.reports.facts import RunFacts
+from rotavg_ros.reports.map_pictures import trajectory
 from rotavg_ros.reports.page import page_of
 from rotavg_ros.reports.report import PICTURES
 from rotavg_ros.reports.tables import WHY_REFUSED
 from rotavg_ros.reports.theme import DARK, LIGHT, Theme, plain
-from rotavg_ros.reports.time_pictures import flips, orientation, ticks, uncertainty
+from rotavg_ros.reports.time_pictures import flips, orientation, position_error, ticks, uncertainty
 from rotavg_ros.reports.tracks import best_position, tracks_of
 from rotavg_ros.view_graph import EdgeKind
 
@@ -351,6 +352,26 @@ def test_a_single_tick_is_seen(draw: Callable[[RunFacts, Theme], Figure | None],
     assert figure is not None
     curves = [line for axes in figure.axes for line in axes.lines]
     assert curves and all(line.get_marker() not in ("", "None") for line in curves)
+
+
+def test_a_clock_that_went_back_begins_another_line() -> None:
+    record = record_of(simulated_run(300, dimensions=3))
+    (robot,) = record.robots
+    stamp_ns, time_line = robot.stamp_ns.copy(), np.repeat([0, 1], 150)
+    stamp_ns[150:] -= stamp_ns[150] - stamp_ns[0] - 123_456_789
+    assert robot.reference is not None
+    reference = replace(robot.reference, stamp_ns=stamp_ns, time_line=time_line)
+    robot = replace(robot, stamp_ns=stamp_ns, time_line=time_line, reference=reference)
+    answer = replace(record.answer, stamp_ns=stamp_ns, time_line=time_line)
+    facts = RunFacts(replace(record, answer=answer, robots=(robot,)))
+    for draw in (orientation, position_error, uncertainty, trajectory):
+        figure = draw(facts, LIGHT)
+        assert figure is not None
+        over_time = figure.axes[1:] if draw is trajectory else figure.axes
+        for line in (line for axes in over_time for line in axes.lines):
+            time = np.asarray(line.get_xdata(), dtype=float)
+            assert (np.isnan(time).sum(), len(time)) == (1, 301)
+            assert not (np.diff(time) < 0).any()
 
 
 def judged(record: RunRecord, outlier: np.ndarray, rotation_score: np.ndarray) -> RunFacts:
