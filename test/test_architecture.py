@@ -35,7 +35,7 @@ INWARD: dict[str, set[str]] = {
     "reports": {"errors", "metrics", "online", "replay", "version", "view_graph", "whole_file", "wording"},
     "evaluation": {
         *("baselines", "datasets", "errors", "metrics", "online", "reports", "results"),
-        *("rotations", "solver", "stamps", "training", "version", "view_graph"),
+        *("rotations", "solver", "stamps", "training", "version", "view_graph", "wording"),
     },
     "training": {
         "datasets",

@@ -66,7 +66,10 @@ def _run_statistics(arguments: argparse.Namespace) -> int:
     outlier_angle_deg = arguments.outlier_angle
     if outlier_angle_deg is None:
         outlier_angle_deg = 10.0 if bool(graph.is_odometry.any()) else 20.0
-    knows_truth = truth is not None and bool(np.isfinite(truth).all(axis=1).any())
+    known = None if truth is None else torch.from_numpy(np.isfinite(truth).all(axis=1))
+    knows_truth = known is not None and bool((known[graph.source] & known[graph.target]).any())
+    if arguments.truth is not None and not knows_truth:
+        raise PlotError(f"{arguments.truth}: knows the orientations of both ends of no edge; leave --truth out")
     output = arguments.output or Path(f"{stem_of(arguments.graph)}-statistics.png")
     with working("solving and drawing"):
         noise = edge_noise(graph, torch.from_numpy(truth) if truth is not None and knows_truth else None)

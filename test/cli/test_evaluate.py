@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy.io import savemat
 
 from rotavg_ros import rotations
@@ -344,3 +345,21 @@ def test_rgbd(tmp_path: Path) -> None:
     ours += ("neurora-equal-precisions", "neurora-without-consensus")
     peers = [name for name in ("colmap", "shonan") if is_available(name)]
     assert of_package == dict.fromkeys((*ours, *peers, "cleannet-spt", "neurora-v1", "neurora"), 4)
+
+
+def test_plot_statistics_of_a_truth_that_knows_too_little(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph, truth = tmp_path / "chain.g2o", tmp_path / "truth.csv"
+    graph.write_text("".join(f"EDGE_SE2 {i} {i + 1} 1 0 0.1 1 0 0 1 0 1\n" for i in range(4)))
+    command = ["plot", "statistics", str(graph), "--truth", str(truth), "--output", str(tmp_path / "a.png")]
+    truth.write_text("id,qx,qy,qz,qw\n0,0,0,0,1\n2,0,0,0,1\n")
+    assert main(command) == 2
+    assert f"{truth}: knows the orientations of both ends of no edge" in capsys.readouterr().err
+    assert not (tmp_path / "a.png").exists()
+    truth.write_text("id,qx,qy,qz,qw\n0,0,0,0,1\n1,0,0,0,1\n")
+    said: list[str] = []
+    text = Figure.text
+    monkeypatch.setattr(Figure, "text", lambda self, x, y, s, **look: (said.append(s), text(self, x, y, s, **look)))
+    assert main(command) == 0
+    assert said[1].startswith("1 of 4 edges, noise against the truth")

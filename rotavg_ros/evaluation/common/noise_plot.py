@@ -17,6 +17,7 @@ from rotavg_ros.evaluation.common.plots import BLUE, INK, MUTED, ORANGE, style
 from rotavg_ros.reports.theme import drawable
 from rotavg_ros.solver import solve
 from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.wording import counted
 
 # Upper ends of the angle axis, each of which puts 10° and 20° on a boundary of its bins.
 _ANGLE_RANGES_DEG = (30, 60, 90, 120, 180)
@@ -32,11 +33,13 @@ class EdgeNoise:
     """Noise of M edges, ``R̃_uv = R_uv · noise``, in the source's frame.
 
     Attributes:
+        num_edges: of the graph, those whose noise is unknown included.
         angle_deg: ``(M,)``.
         axis: ``(M, 3)`` unit vectors; NaN where the angle is too small for one.
         is_residual: whether the truth is unknown and the solution was used instead.
     """
 
+    num_edges: int
     angle_deg: np.ndarray
     axis: np.ndarray
     is_residual: bool
@@ -57,7 +60,7 @@ def edge_noise(graph: ViewGraph, body_from_world: Tensor | None) -> EdgeNoise:
     angle_deg = np.degrees(np.linalg.norm(vector, axis=1))
     with np.errstate(invalid="ignore", divide="ignore"):
         axis = np.where(angle_deg[:, None] > _MIN_ANGLE_DEG, vector / np.radians(angle_deg)[:, None], np.nan)
-    return EdgeNoise(angle_deg, axis, body_from_world is None)
+    return EdgeNoise(graph.num_edges, angle_deg, axis, body_from_world is None)
 
 
 def draw(path: Path, noise: EdgeNoise, title: str, outlier_angle_deg: float) -> None:
@@ -72,8 +75,10 @@ def draw(path: Path, noise: EdgeNoise, title: str, outlier_angle_deg: float) -> 
     what = "residuals of the solution; the truth is unknown" if noise.is_residual else "noise against the truth"
     quantiles = np.percentile(noise.angle_deg, (50, 90)) if len(noise.angle_deg) else (np.nan, np.nan)
     outliers = 100 * (noise.angle_deg > outlier_angle_deg).mean() if len(noise.angle_deg) else np.nan
+    known = len(noise.angle_deg)
+    of_how_many = f"{known} of {noise.num_edges} edges" if known < noise.num_edges else counted(known, "edge")
     subtitle = (
-        f"{len(noise.angle_deg)} edges, {what}   ·   median {quantiles[0]:.3g}°, 90 % below {quantiles[1]:.3g}°   ·   "
+        f"{of_how_many}, {what}   ·   median {quantiles[0]:.3g}°, 90 % below {quantiles[1]:.3g}°   ·   "
         f"{outliers:.1f} % beyond {outlier_angle_deg:g}°"
     )
     figure.text(0.025, 0.885, subtitle, fontsize=10, color=MUTED, va="center")
