@@ -61,13 +61,11 @@ def _lines(robots: Sequence[Tracks], theme: Theme) -> Iterator[Line]:
     """Times, positions and line styles: colours distinguish before and after or, if there are several, the robots."""
     several = len(robots) > 1
     for number, robot in enumerate(robots):
-        own = theme.robots[number % len(theme.robots)]
+        own = theme.line_of(number)
         if robot.odometry is not None:
-            before = {"color": own, "alpha": 0.5} if several else {"color": theme.odometry, "label": "odometry alone"}
+            before = {**own, "alpha": 0.5} if several else {"color": theme.odometry, "label": "odometry alone"}
             yield robot.time, robot.odometry, {**_BEFORE, **before}
-        after = (
-            {"color": own, "label": plain(robot.robot)} if several else {"color": theme.corrected, "label": "corrected"}
-        )
+        after = {**own, "label": plain(robot.robot)} if several else {"color": theme.corrected, "label": "corrected"}
         yield robot.time, robot.corrected, {**_AFTER, **after}
         if robot.reference is not None:
             name = {} if several else {"label": "reference"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, LinearSegmentedColormap
@@ -14,6 +15,7 @@ WIDTH = 5.6  # inches, for every picture: the text is readable on a phone as wel
 _PIXELS_PER_INCH = 170
 _LONGEST_LABEL = 20
 _TITLE_PAD, _LEGEND_ROW = 8, 15  # points
+_DASHES = ("-", (0, (3, 1, 1, 1)), (0, (1, 1)))  # short enough for the legend
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class Theme:
         kept, flagged: loop closures that are believed and those that are not.
         missed, wrongly_flagged: verdicts that the truth contradicts.
         between: closures with a score of 0.5.
-        robots: one colour each, repeated cyclically.
+        robots: one colour each, repeated cyclically with other dashes, see :meth:`line_of`.
     """
 
     name: str
@@ -49,6 +51,11 @@ class Theme:
     def scores(self) -> Colormap:
         """Colours from a score of 0 (believed) to 1 (false)."""
         return LinearSegmentedColormap.from_list("scores", [self.kept, self.between, self.flagged])
+
+    def line_of(self, robot: int) -> dict[str, Any]:
+        """Colour and dashes of a robot's lines, counted from 0; they differ up to three times as many as colours."""
+        turn, colour = divmod(robot, len(self.robots))
+        return {"color": self.robots[colour], "linestyle": _DASHES[turn % len(_DASHES)]}
 
     def figure(self, width: float, height: float) -> Figure:
         """An empty picture; the size in inches."""

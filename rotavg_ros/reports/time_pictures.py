@@ -152,8 +152,10 @@ def _one_line_per_robot(
     figure, (axes,) = _column(facts, theme, 1)
     several = len(curves) > 1
     for number, (robot, values) in enumerate(curves):
-        curve = {plain(robot.robot): (values, theme.robots[number % len(theme.robots)])}
+        line = theme.line_of(number)
+        curve = {plain(robot.robot): (values, line["color"])}
         over_time(axes, facts.time(robot.stamp_ns), curve, unit, time_line=robot.time_line)
+        axes.lines[-1].set_linestyle(line["linestyle"])
     theme.dress(axes, title, facts.clock.unit, legend_rows=-(-len(curves) // 4) if several else 0)
     return figure
 

@@ -223,6 +223,15 @@ def test_a_robot_without_a_reference_lies_beside_the_others(record: RunRecord) -
     np.testing.assert_array_equal(unjoined.corrected, best_position(beta))
 
 
+def test_robots_of_one_colour_have_other_dashes(record: RunRecord) -> None:
+    many = replace(record, robots=tuple(replace(record.robots[0], robot=f"robot_{number}") for number in range(14)))
+    for draw in (trajectory, uncertainty):
+        figure = draw(RunFacts(many), LIGHT)
+        assert figure is not None
+        named = [line for line in figure.axes[0].lines if str(line.get_label()).startswith("robot_")]
+        assert len({(str(line.get_color()), str(line._dash_pattern)) for line in named}) == len(named) == 14
+
+
 def test_robots_without_a_panel_of_their_own_are_told(record: RunRecord) -> None:
     many = replace(record, robots=tuple(replace(record.robots[0], robot=f"robot_{number}") for number in range(7)))
     section = page_of(RunFacts(many)).sections[1]
