@@ -231,16 +231,13 @@ def _updated(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | Non
     graph, links = with_more_links(graph, memory.links, memory.graph.num_edges)
     before = memory.poses
     calibrated = memory.calibrated(graph)
-    start = run.warm_start.double() if before is None else before.start_alone(calibrated)
-    if start is None or (before is None) is has_places(graph):
+    if (before is None) is has_places(graph):
         return None
-    found = memory.updated(graph, _networks(run), start)
+    alone = None if before is None else before.start_alone(calibrated)
+    found = memory.updated(graph, _networks(run), run.warm_start.double() if alone is None else alone)
     estimate = found.estimate
     if before is not None:
-        poses = poses_of_update(calibrated, found.mode, before)
-        if poses is None:
-            return None
-        estimate = with_poses(graph, estimate, poses)
+        estimate = with_poses(graph, estimate, poses_of_update(calibrated, found.mode, before))
     assert isinstance(estimate.memory, SlamMemory)
     return replace(estimate.memory, links=links).since(memory, estimate.outlier_score)
 

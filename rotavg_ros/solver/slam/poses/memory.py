@@ -6,7 +6,7 @@ the joint solve begins at the earlier poses, noise and classes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 import torch
@@ -83,7 +83,10 @@ class PoseMemory:
         return Growth.of(graph, new[graph.is_odometry[new].numpy()], self.num_nodes)
 
     def start(self, graph: ViewGraph, problem: PoseProblem) -> PoseStart | None:
-        """Start of the joint solve of a graph that has grown from this one; None: start from nothing.
+        """Start of the joint solve of a graph that has grown from this one.
+
+        Where nodes do not hang on odometry (another robot begins) or chains of it have become one, only the noise and
+        the classes of places are those of before.
 
         Args:
             graph: the calibrated graph whose odometry was contracted.
@@ -93,13 +96,13 @@ class PoseMemory:
         growth = self._growth(graph)
         grown = None if growth is None else self._grown(graph, growth)
         is_merged = not np.array_equal(drawn.nodes[drawn.roots], self.roots)
+        # The verdict on whether the robot keeps a vertical may have changed.
+        noise = self.noise if problem.drift_axis is not None else replace(self.noise, tilt=self.noise.turn)
         if grown is None or is_merged:
-            return None
+            return PoseStart.kept(problem, self.kept(self.num_edges), np.array(astuple(noise)))
         orientation, position = grown
         correction = drawn.corrections(orientation).numpy().T
         common = np.zeros((problem.num_runs, 6))
-        # The verdict on whether the robot keeps a vertical may have changed.
-        noise = self.noise if problem.drift_axis is not None else replace(self.noise, tilt=self.noise.turn)
         state = PoseState(np.ascontiguousarray(correction), position[drawn.nodes], common, noise, self.pose.state.shape)
         column = np.full(graph.num_edges, -1)
         column[self.edge] = np.arange(len(self.edge))

@@ -80,13 +80,10 @@ def median_poses(graph: ViewGraph, modes: list[Mode], tuned: Callable[[Mode], Mo
     return Median(PoseMemory.of(rivals.poses[middle], poses), rivals.modes[middle], rivals.cost)
 
 
-def poses_of_update(graph: ViewGraph, mode: Mode, memory: PoseMemory) -> PoseMemory | None:
-    """Poses of a calibrated graph that has grown, with the labels of its rotations; None if a whole solve is due."""
+def poses_of_update(graph: ViewGraph, mode: Mode, memory: PoseMemory) -> PoseMemory:
+    """Poses of a calibrated graph that has grown, with the labels of its rotations."""
     problem = memory.problem(graph, _translations(graph), mode)
-    start = memory.start(graph, problem)
-    if start is None:
-        return None
-    return _remembered(estimate_poses(problem, start=start))
+    return _remembered(estimate_poses(problem, start=memory.start(graph, problem)))
 
 
 def poses_of_labels(graph: ViewGraph, mode: Mode) -> PoseMemory:

@@ -154,17 +154,20 @@ def test_odometry_is_appended_without_its_bias_whatever_the_start() -> None:
 
 
 @pytest.mark.parametrize("has_closure", [False, True])
-def test_a_second_robot_begins(has_closure: bool) -> None:
+@pytest.mark.parametrize("with_places", [False, True])
+def test_a_second_robot_begins(has_closure: bool, with_places: bool) -> None:
     case = drawn("building: 30 % random", 1)
-    known = until(case.graph, 500)
+    whole_graph = replace(case.graph, translation=torch.from_numpy(case.edge_translation) if with_places else None)
+    known = until(whole_graph, 500)
     before = solve(known, profile="slam")
     first = 504 if has_closure else 500
-    chain = until(case.graph, 4)
+    chain = until(whole_graph, 4)
     chain = chain.select_edges(chain.is_odometry)
-    both = until(case.graph, first)
+    both = until(whole_graph, first)
     later = both.select_edges(torch.arange(known.num_edges, both.num_edges))
     parts = known, later, replace(chain, source=chain.source + first, target=chain.target + first)
     names = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
+    names += ("translation",) if with_places else ()
     columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
     graph = ViewGraph(first + 4, **columns)
     start = grown(graph, before)
@@ -173,6 +176,9 @@ def test_a_second_robot_begins(has_closure: bool) -> None:
     assert set(after.stage_seconds) == {"update"}
     angle = rotations.angle_between(after.body_from_world, whole.body_from_world)
     assert np.degrees(float(angle.mean())) < 0.3
+    if with_places:
+        assert after.position is not None and whole.position is not None
+        assert float((after.position - whole.position).norm(dim=1).mean()) < 0.05
 
 
 @pytest.mark.parametrize("was_good", [True, False])
