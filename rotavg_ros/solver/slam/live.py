@@ -24,7 +24,6 @@ from rotavg_ros.solver.running.resumable import Resumable
 from rotavg_ros.solver.running.work import metered
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
-from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.links import with_links, with_more_links
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.options import SlamStages
@@ -33,9 +32,10 @@ from rotavg_ros.solver.slam.posterior.state import Noise
 from rotavg_ros.solver.slam.solve import whole
 from rotavg_ros.solver.slam.update.columns import Columns
 from rotavg_ros.solver.slam.update.conditioned import Conditioned, LaidOn, conditioned
+from rotavg_ros.solver.slam.update.copies import Copies
 from rotavg_ros.solver.slam.update.grown_edges import begins_with
 from rotavg_ros.solver.slam.update.linear import Linear
-from rotavg_ros.solver.slam.update.memory import SlamMemory, with_poses
+from rotavg_ros.solver.slam.update.memory import SlamMemory, with_copies, with_poses
 from rotavg_ros.view_graph import ViewGraph
 
 # Share of a tick's remaining work for an update while a whole search waits for the rest; share of the tick's own work
@@ -52,11 +52,20 @@ _FAR = math.radians(30)
 def update_slam(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | None:
     """The answer of a graph that has grown since ``memory``; None if it cannot be continued from.
 
+    Of several statements of one measurement only the first counts.
+
     Args:
         graph: N nodes, M edges.
         memory: memory of the last answer.
         run: includes the units of work that may be spent, exceeded at most by one factorisation.
     """
+    copies = Copies.of(graph)
+    estimate = _update_once(graph if copies is None else copies.once, memory, run)
+    return None if estimate is None else with_copies(estimate, copies)
+
+
+def _update_once(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | None:
+    """The answer of a graph without repeated edges."""
     with run.watch.stage("update"):
         known = _caught_up(graph, memory, run)
         if known is None and not run.anew:
@@ -87,7 +96,16 @@ def resume_slam(graph: ViewGraph, labels: KeptLabels, run: Run) -> Estimate | No
     There is no earlier answer to fall back on, so this solve is not suspended. If closures have joined separate parts,
     ``run.warm_start`` says how, and a whole search, alongside the next answers, decides which of them are good.
     """
-    if run.warm_start is None or labels.by_places is not has_places(graph) or first_of_each(graph) is not None:
+    copies = Copies.of(graph)
+    if copies is None:
+        return _resume_once(graph, labels, run)
+    estimate = _resume_once(copies.once, copies.labels_once(labels), run)
+    return None if estimate is None else with_copies(estimate, copies)
+
+
+def _resume_once(graph: ViewGraph, labels: KeptLabels, run: Run) -> Estimate | None:
+    """The same for a graph without repeated edges."""
+    if run.warm_start is None or labels.by_places is not has_places(graph):
         return None
     is_known = len(labels.noise) == len(fields(Noise)) and Noise(*labels.noise.tolist()).is_possible
     if not is_known or not begins_with(graph, labels.graph, len(labels.trusted)):

@@ -16,7 +16,6 @@ from rotavg_ros.solver.running.work import metered
 from rotavg_ros.solver.slam import stages as slam_stages
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.fine_net.tuning import fine_tuned
-from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each, without_repeats
 from rotavg_ros.solver.slam.links import with_links
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.calibration import calibrated
@@ -28,7 +27,8 @@ from rotavg_ros.solver.slam.posterior.publishing.modes import publish
 from rotavg_ros.solver.slam.posterior.publishing.notes import notes_of
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.preparation import Prepared, prepare
-from rotavg_ros.solver.slam.update.memory import SlamMemory, estimate_of, with_poses
+from rotavg_ros.solver.slam.update.copies import Copies
+from rotavg_ros.solver.slam.update.memory import SlamMemory, estimate_of, with_copies, with_poses
 from rotavg_ros.view_graph import ViewGraph
 
 # Assumed work of an update, as a share of a whole solve's, until one has been measured.
@@ -37,21 +37,8 @@ _UPDATE = 0.1
 
 def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     """Solves a graph on the CPU; of several statements of one measurement only the first counts."""
-    repeats = first_of_each(graph)
-    if repeats is None:
-        return _solve_once(graph, stages, run)
-    says_as = torch.from_numpy(repeats[1])
-    estimate = _solve_once(without_repeats(graph, *repeats), stages, run)
-    places = estimate.places
-    if places is not None:
-        # Least squares on all copies counts the measurement once, as the solve does.
-        precision = places.precision[says_as] / torch.bincount(says_as)[says_as, None]
-        places = replace(places, rotation_score=places.rotation_score[says_as], precision=precision)
-    restated = estimate.restated
-    if restated is not None:
-        restated = torch.isin(says_as, restated).nonzero()[:, 0]
-    score = estimate.outlier_score[says_as]
-    return replace(estimate, outlier_score=score, memory=None, places=places, restated=restated)
+    copies = Copies.of(graph)
+    return with_copies(_solve_once(graph if copies is None else copies.once, stages, run), copies)
 
 
 def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:

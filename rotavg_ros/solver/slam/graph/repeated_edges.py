@@ -36,9 +36,10 @@ def first_of_each(graph: ViewGraph) -> tuple[np.ndarray, np.ndarray] | None:
     source, target = graph.source.numpy(), graph.target.numpy()
     pair = np.minimum(source, target) * np.int64(graph.num_nodes) + np.maximum(source, target)
     in_order = np.sort(pair)
-    parallel = np.isin(pair, in_order[1:][in_order[1:] == in_order[:-1]]).nonzero()[0]
-    if len(parallel) == 0:
+    several = in_order[1:][in_order[1:] == in_order[:-1]]
+    if len(several) == 0:
         return None
+    parallel = np.isin(pair, several).nonzero()[0]
     chosen = graph.select_edges(torch.from_numpy(parallel))
     forwards = (chosen.source < chosen.target)[:, None]
     rotation = torch.where(forwards, chosen.target_from_source, rotations.inverse(chosen.target_from_source)).numpy()
@@ -74,12 +75,3 @@ def without_repeats(graph: ViewGraph, first: np.ndarray, says_as: np.ndarray) ->
     highest = stated.new_zeros(len(first)).scatter_reduce(0, torch.from_numpy(says_as), stated, "amax")
     once = graph.select_edges(torch.from_numpy(first))
     return replace(once, precision=torch.where(highest > 0, highest, torch.nan))
-
-
-def repeats_since(graph: ViewGraph, count: int) -> bool:
-    """Whether edges from number ``count`` on repeat any edge, in a graph whose first ``count`` edges repeat none."""
-    source, target = graph.source.numpy(), graph.target.numpy()
-    touched = np.zeros(graph.num_nodes, dtype=bool)
-    touched[source[count:]] = touched[target[count:]] = True
-    between = np.flatnonzero(touched[source] & touched[target])
-    return first_of_each(graph.select_edges(torch.from_numpy(between))) is not None

@@ -20,7 +20,6 @@ from rotavg_ros.solver.running.kept_labels import KeptLabels
 from rotavg_ros.solver.running.resumable import Resumable
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
-from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each, repeats_since
 from rotavg_ros.solver.slam.links import as_closures, as_odometry
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.calibration import Calibration, calibrated
@@ -32,6 +31,7 @@ from rotavg_ros.solver.slam.posterior.publishing.notes import notes_of
 from rotavg_ros.solver.slam.posterior.state import Noise
 from rotavg_ros.solver.slam.stages import outlier_scores
 from rotavg_ros.solver.slam.update.columns import Columns
+from rotavg_ros.solver.slam.update.copies import Copies
 from rotavg_ros.solver.slam.update.grown_edges import begins_with, thinned_out
 from rotavg_ros.solver.slam.update.labelled import UNKNOWN, Labelled, solved_from
 from rotavg_ros.view_graph import ViewGraph
@@ -76,6 +76,7 @@ class SlamMemory:
         update_work: units that the last update took.
         columns: columns of new closures, until the update has ended.
         links: ``(n,)`` edges that are odometry in ``graph``, but closures to the caller.
+        copies: the caller's graph, if it repeats some of the edges of ``graph``.
     """
 
     graph: ViewGraph
@@ -98,6 +99,7 @@ class SlamMemory:
     update_work: float = 0.0
     columns: Columns | None = None
     links: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    copies: Copies | None = None
 
     @classmethod
     def of(
@@ -166,7 +168,8 @@ class SlamMemory:
         unexplained = self.unexplained if self.ahead is None else self.with_all_unexplained().unexplained
         search = np.array([self.searched, unexplained, self.is_divided], dtype=np.float64)
         graph = as_closures(self.graph, self.links)
-        return KeptLabels(graph, self.trusted, np.array(astuple(self.noise)), calibration, places, noise, search)
+        kept = KeptLabels(graph, self.trusted, np.array(astuple(self.noise)), calibration, places, noise, search)
+        return kept if self.copies is None else self.copies.labels_of_all(kept)
 
     @property
     def is_due(self) -> bool:
@@ -209,8 +212,8 @@ class SlamMemory:
         return as_odometry(graph, self.links, self.graph.steps.numpy()[self.links])
 
     def is_grown_to(self, graph: ViewGraph) -> bool:
-        """Whether ``graph`` has grown from this memory's graph, by edges that repeat no measurement."""
-        return begins_with(graph, self.graph) and not repeats_since(graph, self.graph.num_edges)
+        """Whether ``graph`` has grown from this memory's graph."""
+        return begins_with(graph, self.graph)
 
     def thinned_to(self, graph: ViewGraph) -> SlamMemory | None:
         """The memory for a graph that has lost keyframes, as input of :meth:`updated`; None if that is impossible.
@@ -220,7 +223,7 @@ class SlamMemory:
         odometry = self.graph.is_odometry.numpy()
         if graph.num_nodes >= self.graph.num_nodes:
             return None
-        if (self.trusted[odometry] <= _GOOD).any() or first_of_each(graph) is not None:
+        if (self.trusted[odometry] <= _GOOD).any():
             return None
         if self.poses is not None and self.poses.pose.problem.jump is not None:
             return None
@@ -311,6 +314,14 @@ def estimate_of(published: Published) -> Estimate:
         step_variance=published.noise.step_variance,
         restated=torch.from_numpy(published.graph.restated.edge),
     )
+
+
+def with_copies(estimate: Estimate, copies: Copies | None) -> Estimate:
+    """The estimate of a graph that states everything once, as that of one that has these copies in addition."""
+    memory = estimate.memory
+    if isinstance(memory, SlamMemory):
+        estimate = replace(estimate, memory=replace(memory, copies=copies))
+    return estimate if copies is None else copies.of_all(estimate)
 
 
 def with_poses(graph: ViewGraph, estimate: Estimate, memory: PoseMemory) -> Estimate:

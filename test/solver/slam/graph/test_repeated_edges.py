@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from rotavg_ros import EdgeLabel, ViewGraph, rotations, solve
-from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each, repeats_since
+from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from test.solver.graphs import measured, random_truth, slam_edges, small_noise
 
 
@@ -113,13 +113,3 @@ def test_no_translation_is_not_one_of_zero() -> None:
     translation = torch.zeros(again.num_edges, 3, dtype=torch.float64)
     translation[graph.num_edges :] = torch.nan
     assert first_of_each(replace(again, translation=translation)) is None
-
-
-@pytest.mark.parametrize("again", [0, 3, 70])
-def test_new_edges_may_say_what_older_or_new_ones_do(again: int) -> None:
-    graph = _noisy_graph(60, 30, 0)
-    assert not repeats_since(graph, 50) and not repeats_since(graph, graph.num_edges)
-    copied = graph.select_edges(torch.tensor([*range(graph.num_edges), again]))
-    repeated = _turned(copied, torch.tensor([graph.num_edges]))
-    assert first_of_each(repeated) is not None and repeats_since(repeated, graph.num_edges)
-    assert repeats_since(repeated, 60)  # both of the last come since
