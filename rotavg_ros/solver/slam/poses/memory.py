@@ -14,9 +14,10 @@ import torch
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.odometry_lengths import ways_passed
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
+from rotavg_ros.solver.slam.graph.walk import Walk, mean_square
 from rotavg_ros.solver.slam.poses.closures import Places
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
-from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.problem import PoseProblem, crossing
 from rotavg_ros.solver.slam.poses.publishing.answer import Poses
 from rotavg_ros.solver.slam.poses.row_errors import mean_turn
 from rotavg_ros.solver.slam.poses.solved import PoseMode
@@ -37,6 +38,7 @@ class PoseMemory:
         edge: ``(C,)`` the view-graph's edges that are closures.
         places: their classes.
         pose: the joint solve.
+        walk: errors of odometry since then.
     """
 
     poses: Poses
@@ -46,6 +48,7 @@ class PoseMemory:
     edge: np.ndarray
     places: Places
     pose: PoseMode
+    walk: Walk
 
     @classmethod
     def of(cls, pose: PoseMode, poses: Poses) -> PoseMemory:
@@ -53,7 +56,8 @@ class PoseMemory:
         drawn, mode = pose.problem.drawn, pose.problem.mode
         alone = drawn.orientations(torch.from_numpy(np.ascontiguousarray(mode.state.correction.T)))
         closures, places = pose.problem.closures, pose.solved.places
-        return cls(poses, alone, pose.state.noise, drawn.nodes[drawn.roots], closures, places, pose)
+        walk = Walk.begin(len(poses.position))
+        return cls(poses, alone, pose.state.noise, drawn.nodes[drawn.roots], closures, places, pose, walk)
 
     @property
     def num_nodes(self) -> int:
@@ -116,6 +120,12 @@ class PoseMemory:
         return places
 
     @property
+    def crossing(self) -> np.ndarray:
+        """``(3, m, k)`` v × in the axes of shifts and turns."""
+        problem = self.pose.problem
+        return crossing(*problem.bases).reshape(3, problem.shifts, problem.turns)
+
+    @property
     def step_variance(self) -> float:
         """rad², variance of one step of odometry, averaged over components and steps."""
         return mean_turn(self.pose.problem, self.noise)
@@ -131,13 +141,14 @@ class PoseMemory:
         assert graph.translation is not None
         steps = graph.steps.numpy()
         own = noise.of_odometry(np.stack((ways_passed(graph.translation[new].numpy()), steps[new]), axis=1))
-        # The way from its anchor to a node turns with the anchor's heading and with the headings of its own steps.
-        way = np.linalg.norm(position[self.num_nodes :] - position[growth.anchor], axis=1)
-        turned = self.step_variance * growth.along(steps[growth.edge])
-        lever = (poses.variance[growth.anchor] + turned / WALK) * way**2 * ACROSS
-        shifted = lever + growth.along(own[growth.edge - self.num_edges])
-        variance = np.append(poses.variance, poses.variance[growth.anchor] + turned)
-        position_variance = np.append(poses.position_variance, poses.position_variance[growth.anchor] + shifted)
+        attached = growth.edge - self.num_edges
+        passed = np.stack((self.step_variance * steps[growth.edge], own[attached]))
+        walk = self.walk.along(growth, passed, position)
+        added = walk.since(len(self.walk.anchor))
+        (turned, moved), crossed = added.variances(self.crossing), mean_square(self.crossing)
+        moved += poses.variance[added.anchor] * np.einsum("na,ab,nb->n", added.way, crossed, added.way)
+        variance = np.append(poses.variance, poses.variance[added.anchor] + turned)
+        position_variance = np.append(poses.position_variance, poses.position_variance[added.anchor] + moved)
         precision = np.stack((1 / (self.step_variance * steps[new]), 1 / own), axis=1)
         nothing = np.zeros(len(new))
         alone = _laid_on(self.alone, growth)
@@ -151,7 +162,7 @@ class PoseMemory:
             rotation_probability=np.append(poses.rotation_probability, nothing),
             precision=np.concatenate((poses.precision, precision)),
         )
-        return replace(self, poses=grown_poses, alone=alone)
+        return replace(self, poses=grown_poses, alone=alone, walk=walk)
 
     def _grown(self, graph: ViewGraph, growth: Growth) -> tuple[torch.Tensor, np.ndarray] | None:
         """Poses of all nodes, ``(N, 4)`` body_from_world and ``(N, 3)``; None unless the growth has translations."""
@@ -171,9 +182,3 @@ def _laid_on(orientation: torch.Tensor, growth: Growth) -> torch.Tensor:
     """Orientations of known nodes, and of new ones along odometry from these."""
     anchor = torch.from_numpy(growth.anchor)
     return torch.cat((orientation, rotations.normalize(rotations.multiply(growth.turn, orientation[anchor]))))
-
-
-# Errors of the heading move the end of the way. If they are a random walk, the squared displacement is a third of that
-# of a constant error with the final variance. The displacement is across the way: in the plane, that is one of its two
-# components, so the variance per component is half of the sum.
-WALK, ACROSS = 3.0, 0.5

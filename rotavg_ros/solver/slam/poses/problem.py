@@ -36,6 +36,11 @@ LEAST_LENGTH = 1e-3
 _FARTHEST = 1e3
 
 
+def crossing(turns: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+    """``(3, m k)`` map from v to the entries of v × in bases ``(3, k)`` and ``(3, m)``: (v × a) · b = v · (a × b)."""
+    return np.asarray(np.cross(turns.T[None], shifts.T[:, None]).reshape(-1, 3).T)
+
+
 @dataclass(frozen=True)
 class PoseProblem:
     """A labelling of a robot's graph, with translations (E edges: S segments first; C closures).

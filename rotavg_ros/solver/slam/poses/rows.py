@@ -10,18 +10,13 @@ from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.slam.poses.closures import ANYWHERE
 from rotavg_ros.solver.slam.poses.displacements import Displacements
-from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.problem import PoseProblem, crossing
 from rotavg_ros.solver.slam.poses.row_errors import common_turn
 from rotavg_ros.solver.slam.poses.state import PoseState
 from rotavg_ros.solver.slam.posterior.densities import anyhow
 
 # Stiffness of the roots, relative to the stiffest row.
 _GROUNDING = 1e6
-
-
-def crossing(turns: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-    """``(3, m k)`` map from v to the entries of v × in bases ``(3, k)`` and ``(3, m)``: (v × a) · b = v · (a × b)."""
-    return np.asarray(np.cross(turns.T[None], shifts.T[:, None]).reshape(-1, 3).T)
 
 
 def residuals(problem: PoseProblem, state: PoseState, way: Displacements) -> np.ndarray:

@@ -17,14 +17,14 @@ from scipy.sparse import csr_array
 from scipy.special import expit
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.products import product
 from rotavg_ros.solver.algebra.quaternion_rows import turned_back
+from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.graph.routes import ways_by
-from rotavg_ros.solver.slam.poses.memory import ACROSS, WALK
-from rotavg_ros.solver.slam.poses.rows import crossing
+from rotavg_ros.solver.slam.graph.walk import Dependence, Walk, common_walk
+from rotavg_ros.solver.slam.poses.problem import crossing
 from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.update.columns import Columns
@@ -101,7 +101,8 @@ def conditioned(
     columns = columns.with_anchors(linear, system.anchors)
     count = len(columns.edge)
     covariance, residual = system.covariance(columns.covariance, count), system.residual[:count]
-    rows = system.of_new_nodes(columns)
+    walked = system.walked_to_new(count)
+    rows = system.of_new_nodes(columns, walked)
     odds, rotation_odds = system.log_odds(*Given.none(count, linear.size).left_out(covariance, residual), slice(count))
     given, changes = columns.given.changed_to(covariance, odds > 0)
     surer = _surer(columns.surer, rows, given, changes)
@@ -116,9 +117,10 @@ def conditioned(
     score = expit(-np.append(odds, apart[0]))
     rotation_score = expit(-np.append(rotation_odds, apart[1]))
     precision = np.stack((1 / system.own[0], system.is_known / system.own[1]), axis=1)
-    return Conditioned(
-        system.moved(columns, given, surer), score, np.minimum(score, rotation_score), precision, columns
-    )
+    moved = system.moved(columns, given, walked)
+    if given.is_given.any():
+        moved = replace(moved, variance=system.lowered(surer))
+    return Conditioned(moved, score, np.minimum(score, rotation_score), precision, columns)
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,7 @@ class _System:
         older: ``(n,)`` the end in whose axes each translation is stated.
         anchor: ``(N',)`` node of the last solve that each node moves with; for nodes of that solve, the node itself.
         way: ``(N', 3)`` metres from the anchor.
-        along: ``(2, N')`` rad² and m², variance of odometry from the anchor.
+        walk: odometry since the last solve.
         residual: ``(n, d, q)``: q = 1; or by rotations alone, d = 1 and q = 3.
         displacement: ``(n, 3)`` metres, measured translations in the world; 0 where unknown.
         own: ``(2, n)`` rad² and m², variances of good closures of typical stated variance.
@@ -146,7 +148,7 @@ class _System:
     older: np.ndarray
     anchor: np.ndarray
     way: np.ndarray
-    along: np.ndarray
+    walk: Walk
     residual: np.ndarray
     displacement: np.ndarray
     own: np.ndarray
@@ -155,21 +157,16 @@ class _System:
     @classmethod
     def of(cls, linear: Linear, laid: LaidOn, growth: Growth, edge: np.ndarray) -> _System:
         graph, noise = laid.graph, linear.noise
-        known = np.arange(linear.num_nodes)
-        anchor = np.append(known, growth.anchor)
-        position = np.zeros((len(anchor), 3)) if laid.position is None else laid.position
-        way = position - position[anchor]
-        steps = growth.along(graph.steps.numpy()[growth.edge])
-        moved = np.zeros(len(growth.edge))
+        position = np.zeros((graph.num_nodes, 3)) if laid.position is None else laid.position
+        steps = graph.steps.numpy()[growth.edge]
+        passed = np.stack((noise.turn * steps, np.zeros(len(steps))))
         if laid.position is not None and graph.translation is not None:
             step = graph.translation[torch.from_numpy(growth.edge)]
             metres = torch.linalg.vector_norm(step, dim=1).nan_to_num().numpy()
-            own = np.stack((metres, graph.steps.numpy()[growth.edge]), axis=1)
-            moved = growth.along(noise.of_odometry(own))
-        turned = noise.turn * steps
-        lever = turned / WALK * (way[linear.num_nodes :] ** 2).sum(axis=1) * ACROSS
-        along = np.zeros((2, len(anchor)))
-        along[:, linear.num_nodes :] = turned, moved + lever
+            passed[1] = noise.of_odometry(np.stack((metres, steps), axis=1))
+        walk = Walk.begin(linear.num_nodes).along(growth, passed, position)
+        anchor = np.append(np.arange(linear.num_nodes), walk.anchor)
+        way = np.concatenate((np.zeros((linear.num_nodes, 3)), walk.way))
         source, target = graph.source[edge], graph.target[edge]
         body_from_world = laid.body_from_world
         expected = rotations.multiply(graph.target_from_source[edge].double(), body_from_world[source])
@@ -198,7 +195,7 @@ class _System:
             older,
             anchor,
             way,
-            along,
+            walk,
             residual,
             displacement,
             own,
@@ -249,31 +246,37 @@ class _System:
 
     def _crossed(self, vector: np.ndarray) -> np.ndarray:
         """``(n, m, k)`` matrices of v × in the axes of shifts and turns."""
-        turns, shifts = self.linear.turns, self.linear.shifts
-        assert turns is not None and shifts is not None
-        return np.asarray((vector @ crossing(turns, shifts)).reshape(len(vector), shifts.shape[1], turns.shape[1]))
+        return np.asarray(np.tensordot(vector, self._crossing, 1))
 
     def covariance(self, by_columns: np.ndarray, count: int) -> np.ndarray:
         """``(n, d, n, d)`` S of the first ``count`` closures, given A H⁻¹ Aᵀ ``(n d, n d)``."""
         d, (k, m) = self.linear.size, self._widths
         between: np.ndarray = by_columns.reshape(count, d, count, d).copy()
-        walked = self._walked(np.stack((self.target[:count], self.source[:count])), np.array([1.0, -1.0]), count)
-        component = np.repeat([0, 1], (k, m))
+        ends = self._ends(count)
+        between += common_walk(self.walk, self._crossing, ends, ends)
         inside = np.arange(count)
-        for axis, kind in enumerate(component):
-            between[:, axis, :, axis] += walked[kind]
+        for axis, kind in enumerate(np.repeat([0, 1], (k, m))):
             between[inside, axis, inside, axis] += self._besides(slice(count))[kind]
         return between
 
-    def _walked(self, node: np.ndarray, sign: np.ndarray, count: int) -> np.ndarray:
-        """``(2, m, n)`` rad² and m²: covariance of nodes and closures' residuals, by odometry since the last solve.
+    def _ends(self, count: int) -> Dependence:
+        """How the residuals of the first n closures depend on their ends."""
+        node = np.stack((self.target[:count], self.source[:count]))
+        is_older = node == self.older[:count]
+        return Dependence(node, np.array([1.0, -1.0]), np.where(is_older[:, :, None], -self.displacement[:count], 0.0))
 
-        Args:
-            node: ``(s, m)`` nodes; the errors of each column are summed with the signs.
-            sign: ``(s,)`` ±1.
-            count: n, number of closures, the first ones.
-        """
-        return _shared_way(self.anchor, self.along, node, sign, np.stack((self.target[:count], self.source[:count])))
+    def walked_to_new(self, count: int) -> np.ndarray:
+        """``(N' - N, d, n, d)`` rad² and m²: covariance of new nodes and n closures' residuals, by odometry alone."""
+        new = Dependence.on(np.arange(self.linear.num_nodes, len(self.anchor)))
+        return common_walk(self.walk, self._crossing, new, self._ends(count))
+
+    @cached_property
+    def _crossing(self) -> np.ndarray:
+        """``(3, m, k)`` v × in the axes of shifts and turns."""
+        turns, shifts = self.linear.turns, self.linear.shifts
+        if turns is None or shifts is None:
+            return np.zeros((3, 0, 1))
+        return crossing(turns, shifts).reshape(3, shifts.shape[1], turns.shape[1])
 
     def _besides(self, which: slice) -> np.ndarray:
         """``(2, n)`` rad² and m²: closures' own noise, plus the errors of their ends relative to the key nodes."""
@@ -312,33 +315,30 @@ class _System:
         both = told + _log_normal(mean, covariance, 1) - false_turn - false_place
         return np.where(self.is_known[which], both, rotation), rotation
 
-    def moved(self, columns: Columns, by: Given, surer: np.ndarray) -> LaidOn:
-        """The answer after the given closures have moved all nodes, and lowered variances of new ones ``(n, d)``."""
+    def moved(self, columns: Columns, by: Given, walked: np.ndarray) -> LaidOn:
+        """The answer after the given closures have moved all nodes."""
         if not by.is_given.any():
             return self.laid
         linear, d, k, count = self.linear, self.linear.size, self._widths[0], len(by.is_given)
         q = self.residual.shape[2]
-        laid = replace(self.laid, variance=self._lowered(surer))
         pull = product(by.precision, self.residual[:count].reshape(-1, q)).reshape(count, d, q)
         step = columns.moves(linear, pull.reshape(-1, q))
-        new = np.arange(linear.num_nodes, len(self.anchor))
-        walked = self._walked(new[None], np.ones(1), count)
+        along = product(walked.reshape(-1, count * d), pull.reshape(-1, q)).reshape(-1, d, q)
         # Vectors of the world frame: for each block, and for new nodes in addition.
-        turn, walked_turn = step[:, :k], np.einsum("nc,cdq->ndq", walked[0], pull[:, :k])
         turn, walked_turn = (
-            each[:, 0] if linear.turns is None else each[:, :, 0] @ linear.turns.T for each in (turn, walked_turn)
+            each[:, 0] if linear.turns is None else each[:, :k, 0] @ linear.turns.T for each in (step, along)
         )
         before = self.laid.body_from_world.numpy()
         hangs = Hangs(self.anchor, linear.above, linear.below, linear.share)
         orientation = torch.from_numpy(turned(hangs, turn, walked_turn, before))
         if linear.shifts is None or self.laid.position is None:
-            return replace(laid, body_from_world=orientation)
+            return replace(self.laid, body_from_world=orientation)
         shift = step[:, k:, 0] @ linear.shifts.T
-        walked_shift = np.einsum("nc,cd->nd", walked[1], pull[:, k:, 0]) @ linear.shifts.T
+        walked_shift = along[:, k:, 0] @ linear.shifts.T
         position = shifted(hangs, turn, (shift, walked_shift), self.way, self.laid.position)
-        return replace(laid, body_from_world=orientation, position=position)
+        return replace(self.laid, body_from_world=orientation, position=position)
 
-    def of_new_nodes(self, columns: Columns) -> np.ndarray:
+    def of_new_nodes(self, columns: Columns, walked: np.ndarray) -> np.ndarray:
         """``(N' - N, d, n d)`` rad² and m², covariance of new nodes with the residuals of n closures."""
         linear, d, (k, m), count = self.linear, self.linear.size, self._widths, len(columns.edge)
         new = np.arange(linear.num_nodes, len(self.anchor))
@@ -346,17 +346,15 @@ class _System:
             return np.zeros((len(new), d, count * d))
         above, below = columns.at(self.anchors)
         share = linear.share[:, self.anchor[new]][:, :, None, None]
-        walked = self._walked(new[None], np.ones(1), count)
         told = [(1 - share[kind]) * above + share[kind] * below for kind in (0, 1)]
         both = np.concatenate((told[0][:, :k], told[1][:, k:]), axis=1).reshape(len(new), d, count, d)
         if m:
             lever = self._crossed(self.way[new])
             both[:, k:] += np.einsum("nmk,nkcd->nmcd", lever, both[:, :k])
-        for axis, kind in enumerate(np.repeat([0, 1], (k, m))):
-            both[:, axis, :, axis] += walked[kind]
+        both += walked
         return both.reshape(len(new), d, -1)
 
-    def _lowered(self, surer: np.ndarray) -> np.ndarray:
+    def lowered(self, surer: np.ndarray) -> np.ndarray:
         """``(2, N')`` rad² and m², variances of nodes, those of new ones lowered by ``(N' - N, d)``."""
         variance: np.ndarray = self.laid.variance.copy()
         new, k = slice(self.linear.num_nodes, None), self._widths[0]
@@ -392,28 +390,3 @@ def _log_normal(mean: np.ndarray, covariance: np.ndarray, times: int) -> np.ndar
     square = (mean * np.linalg.solve(covariance, mean)).sum(axis=(1, 2))
     log_det = np.linalg.slogdet(covariance)[1] + size * np.log(2 * np.pi)
     return np.asarray(-(square + times * log_det) / 2)
-
-
-@compiled
-def _shared_way(
-    anchor: np.ndarray, along: np.ndarray, node: np.ndarray, sign: np.ndarray, end: np.ndarray
-) -> np.ndarray:
-    """``(2, m, n)`` covariances; two nodes with the same anchor share the shorter of their ways from it.
-
-    Args:
-        anchor: ``(N',)`` node of the last solve that each node moves with.
-        along: ``(2, N')`` variance of odometry from there.
-        node, sign: ``(s, m)`` nodes, and the sign ``(s,)`` of each row.
-        end: ``(2, n)`` closures' targets, which count positive, and sources, which count negative.
-    """
-    total = np.zeros((2, node.shape[1], end.shape[1]))
-    for i in range(node.shape[1]):
-        for j in range(end.shape[1]):
-            for s in range(len(sign)):
-                for e in range(2):
-                    one, other = node[s, i], end[e, j]
-                    if anchor[one] == anchor[other]:
-                        own = sign[s] if e == 0 else -sign[s]
-                        total[0, i, j] += own * min(along[0, one], along[0, other])
-                        total[1, i, j] += own * min(along[1, one], along[1, other])
-    return total
