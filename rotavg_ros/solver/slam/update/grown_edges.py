@@ -39,7 +39,8 @@ def carried_over(value: np.ndarray, closure_graph: ClosureGraph, otherwise: floa
 def thinned_out(value: np.ndarray, earlier: ViewGraph, graph: ViewGraph, otherwise: float) -> np.ndarray | None:
     """Values ``(M,)`` of an earlier graph → ``(M',)`` of a graph that has lost keyframes and edges since.
 
-    Closures are recognised by their measured rotation, bit by bit, since nodes are renumbered. Odometry gets 1.
+    Closures are recognised by their measured rotation, bit by bit, since nodes are renumbered. Of several with the same
+    rotation as many are known as there were, in their order; else those whose values agree. Odometry gets 1.
 
     Args:
         value: values of the earlier graph's edges.
@@ -54,10 +55,17 @@ def thinned_out(value: np.ndarray, earlier: ViewGraph, graph: ViewGraph, otherwi
         return None
     both = np.concatenate((_measured(earlier, old), _measured(graph, new)))
     was, now = np.split(np.unique(both, return_inverse=True)[1].ravel(), [len(old)])
-    order = np.argsort(was, kind="stable")
-    place = np.minimum(np.searchsorted(was, now, sorter=order), len(was) - 1)
-    match = order[place]
-    is_known = was[match] == now
+    order, later = (np.argsort(each, kind="stable") for each in (was, now))
+    rank = np.empty(len(now), dtype=np.int64)
+    rank[later] = np.arange(len(now)) - np.searchsorted(now[later], now[later])
+    counts = [np.bincount(each, minlength=len(both)) for each in (was, now)]
+    are_all = (counts[0] == counts[1])[now]
+    place = np.searchsorted(was, now, sorter=order) + np.where(are_all, rank, 0)
+    match = order[np.minimum(place, len(was) - 1)]
+    least, most = np.full(len(both), np.inf), np.full(len(both), -np.inf)
+    np.minimum.at(least, was, value[old])
+    np.maximum.at(most, was, value[old])
+    is_known = (was[match] == now) & (are_all | (least == most)[now])
     label = np.where(is_known, earlier.label.numpy()[old[match]], EdgeLabel.AUTOMATIC)
     if 2 * is_known.sum() < len(new) or (label != graph.label.numpy()[new]).any():
         return None
