@@ -192,8 +192,9 @@ def _caught_up(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | N
                 return None
             update = known.update
             has_none = update is None or update.has_failed
-            hangs_on = _growth(graph, known, known.graph) is not None
-            if has_none and hangs_on and _num_new_closures(graph, known) == 0:
+            growth = _growth(graph, known, known.graph)
+            hangs_on = growth is not None
+            if has_none and growth is not None and not _is_more(graph, known, growth):
                 return replace(known, update=None)
             if update is None or has_none:
                 before = replace(known, ahead=None, update=None, columns=None)
@@ -236,11 +237,22 @@ def _networks(run: Run) -> tuple[SlamCleanNet, SlamFineNet]:
 
 
 def _growth(graph: ViewGraph, known: SlamMemory, since: ViewGraph | Linear) -> Growth | None:
-    """How nodes newer than ``since`` are attached to older ones; None if some are not, or odometry does more."""
+    """How nodes newer than ``since`` are attached to older ones; None if some are not, or odometry joins chains."""
     new = np.arange(since.num_edges, graph.num_edges)
     new = new[graph.is_odometry[new].numpy()]
     growth = Growth.of(known.calibrated(graph), new, since.num_nodes)
-    return growth if growth is not None and len(growth.edge) == len(new) else None
+    if growth is None or len(growth.edge) == len(new):
+        return growth
+    beside = torch.ones(graph.num_edges, dtype=torch.bool)
+    beside[: since.num_edges] = beside[growth.edge] = False
+    apart = graph.select_edges(~beside).components()
+    ends = apart[graph.source[new]], apart[graph.target[new]]
+    return growth if torch.equal(*ends) else None
+
+
+def _is_more(graph: ViewGraph, known: SlamMemory, growth: Growth) -> bool:
+    """Whether new edges do more than to attach the nodes of this growth."""
+    return graph.num_edges - known.graph.num_edges > len(growth.edge)
 
 
 def _updated(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | None:
@@ -269,7 +281,9 @@ def _laid_on(graph: ViewGraph, known: SlamMemory, ration: float) -> Estimate | N
     if growth is None:
         return None
     if len(closure) == 0:
-        return known.along_odometry(graph, growth)
+        alone = known.along_odometry(graph, growth)
+        # Odometry beside the chain waits for the update, as closures do.
+        return replace(alone, memory=known) if alone is not None and _is_more(graph, known, growth) else alone
     older = known.graph.num_edges
     along = graph.first_edges(older, torch.from_numpy(kept[older:]))
     estimate = known.along_odometry(along, growth.among(kept))

@@ -131,7 +131,10 @@ class PoseMemory:
         return mean_turn(self.pose.problem, self.noise)
 
     def extended(self, graph: ViewGraph, growth: Growth) -> PoseMemory | None:
-        """The memory with new nodes placed along odometry; None if that has no translations."""
+        """The memory with new nodes placed along odometry; None if that has no translations.
+
+        New odometry beside the chain pulls nothing.
+        """
         new = np.arange(self.num_edges, graph.num_edges)
         grown = self._grown(graph, growth)
         if grown is None:
@@ -149,7 +152,10 @@ class PoseMemory:
         moved += poses.variance[added.anchor] * np.einsum("na,ab,nb->n", added.way, crossed, added.way)
         variance = np.append(poses.variance, poses.variance[added.anchor] + turned)
         position_variance = np.append(poses.position_variance, poses.position_variance[added.anchor] + moved)
-        precision = np.stack((1 / (self.step_variance * steps[new]), 1 / own), axis=1)
+        times = np.array((self.pose.problem.mode.state.noise.beside, noise.beside))[:, None].repeat(len(new), axis=1)
+        times[:, attached] = 1.0
+        # Beside the chain a translation may be unknown.
+        precision = np.nan_to_num(1 / (times * (self.step_variance * steps[new], own)), nan=0.0).T
         nothing = np.zeros(len(new))
         alone = _laid_on(self.alone, growth)
         grown_poses = replace(

@@ -20,6 +20,7 @@ from rotavg_ros.solver.running.resumable import Resumable
 from rotavg_ros.solver.running.work import Abandoned, abandonable, metered, resting
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.fine_net.tuning import fine_tuned
+from rotavg_ros.solver.slam.links import as_odometry
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.poses.solve import poses_of_update
@@ -28,6 +29,7 @@ from rotavg_ros.solver.slam.solve import whole
 from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
+from ..linked_keyframes import linked
 from .test_conditioned import drawn as simulated
 from .test_memory import drawn, error_deg, grown, until
 
@@ -244,6 +246,43 @@ def test_between_ticks_what_has_no_translation_moves_no_position() -> None:
             assert after.edge_precision is not None and remembered(after).update is not None
             assert bool((after.edge_precision[edges, 0] > 0).any())
             assert bool((after.edge_precision[edges, 1] == 0).all())
+
+
+@pytest.mark.parametrize("with_places", [False, True])
+def test_odometry_beside_the_chain_waits_for_an_update_as_closures_do(with_places: bool) -> None:
+    """Where a front end sends odometry over two steps as well, each tick had been an update, however long that took."""
+    case = drawn("building: 30 % random", 1)
+    graph = linked(case, 0.1, by_truth=True, spans=(2,))
+    beside = np.arange(case.graph.num_edges, graph.num_edges)
+    graph = as_odometry(graph, beside, np.full(len(beside), 2.0))
+    assert graph.translation is not None
+    unknown = graph.steps > 1 if with_places else torch.ones(graph.num_edges, dtype=torch.bool)
+    graph = replace(graph, translation=torch.where(unknown[:, None], torch.nan, graph.translation))
+    solution = solve(until(graph, 200), profile="slam")
+    known = remembered(solution).graph
+    for count in (202, 204):
+        solution = go_on(until(graph, count), solution, work=0.0)
+        assert solution.work < 0.1 * remembered(solution).update_work
+        assert remembered(solution).graph is known and remembered(solution).update is not None
+        assert (solution.edge_precision is not None) is with_places
+        assert solution.edge_precision is None or bool(torch.isfinite(solution.edge_precision).all())
+    advance(solution.memory, 1e6)
+    solution = go_on(until(graph, 206), solution, work=1e6)
+    assert remembered(solution).graph.num_nodes == 206
+    whole = solve(until(graph, 206), profile="slam")
+    angle = rotations.angle_between(solution.body_from_world, whole.body_from_world)
+    assert np.degrees(float(angle.mean())) < 0.3
+
+
+def test_odometry_that_joins_chains_does_not_wait() -> None:
+    """A robot is at another one's keyframe after all: until it is solved, what that means is not known."""
+    case = drawn("building: 15 closures", 1)
+    chain = case.graph.select_edges(case.graph.is_odometry)
+    apart = chain.select_edges(torch.arange(chain.num_edges) != 100)
+    solution = solve(apart, profile="slam")
+    order = [*(edge for edge in range(chain.num_edges) if edge != 100), 100]
+    found = go_on(chain.select_edges(torch.tensor(order)), solution, work=0.0)
+    assert remembered(found).graph.num_edges == chain.num_edges and int(found.component.max()) == 0
 
 
 @pytest.mark.large
