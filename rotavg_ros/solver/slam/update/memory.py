@@ -221,7 +221,8 @@ class SlamMemory:
         It is impossible if odometry slipped or jumped: once steps are merged, it is no longer known at which of them.
         """
         odometry = self.graph.is_odometry.numpy()
-        if graph.num_nodes >= self.graph.num_nodes:
+        # As many keyframes may have come since; odometry has merged the steps between those that went.
+        if graph.num_nodes >= self.graph.num_nodes and _merged(graph) <= _merged(self.graph):
             return None
         if (self.trusted[odometry] <= _GOOD).any():
             return None
@@ -302,6 +303,11 @@ class SlamMemory:
     def calibrated(self, graph: ViewGraph) -> ViewGraph:
         """The graph without the systematic errors that were found, if any."""
         return calibrated(graph, self.calibration)
+
+
+def _merged(graph: ViewGraph) -> float:
+    """Number of odometry steps that are part of another edge's."""
+    return float((graph.steps[graph.is_odometry] - 1).sum())
 
 
 def estimate_of(published: Published) -> Estimate:

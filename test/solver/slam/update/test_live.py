@@ -314,6 +314,25 @@ def test_a_graph_that_has_lost_keyframes_is_gone_on_from_by_its_labels(with_plac
     pytest.fail("too few keyframes were dropped")
 
 
+def test_as_many_keyframes_may_have_come_as_were_dropped() -> None:
+    """Between two ticks, where few can be spared at a time: the next one had been a whole search."""
+    case = drawn("building: 30 % random", 1)
+    online = OnlineEstimator(EstimatorOptions(keyframe_source="edges", gauge="identity", max_keyframes=200))
+    feed = Feed(case.graph, online)
+    feed.until(190)
+    before = online.tick()
+    feed.until(235)
+    assert before is not None and online.counts().marginalized > 0
+    assert online.counts().keyframes >= len(before.keyframe_id)
+    answer = online.tick(work=LITTLE)
+    assert answer is not None and set(answer.stage_seconds) == {"update"}
+    cold = solve(answer_graph(online), profile="slam")
+    assert (torch.from_numpy(answer.outlier) == (cold.outlier_score > 0.5)).float().mean() > 0.98
+    found = rotations.inverse(torch.from_numpy(answer.world_from_body.copy()))
+    truth = torch.from_numpy(case.body_from_world)[torch.from_numpy(answer.keyframe_id.astype(np.int64))]
+    assert error_of(found, truth) < error_of(cold.body_from_world, truth) + 0.2
+
+
 def answer_graph(online: OnlineEstimator) -> ViewGraph:
     """What the last answer is of."""
     return online.snapshot().graph
