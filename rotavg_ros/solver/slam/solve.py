@@ -86,8 +86,8 @@ def _whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     if "translations" not in stages.without and has_places(graph):
         with run.watch.stage("poses"):
             poses = median_poses(calibrated(graph, found.calibration), found.modes, tune)
-            if found.otherwise is not None:
-                # Translations may tell of a bias where rotations hardly do.
+            if found.otherwise is not None and (found.is_undecided or poses.is_contradicted):
+                # Translations may tell of a bias where rotations hardly do, or tell that there is none.
                 other = median_poses(calibrated(graph, found.otherwise.calibration), found.otherwise.modes, tune)
                 if other.cost + found.otherwise.tilts < poses.cost + found.tilts:
                     found, poses = replace(found.otherwise, suspected=found.suspected), other

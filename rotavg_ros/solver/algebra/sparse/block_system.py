@@ -243,21 +243,14 @@ class BlockFactor:
     def covariance_between(self, jacobian: np.ndarray, row: np.ndarray) -> np.ndarray:
         """Joint covariance ``(n d, n d)`` of some rows; arguments as of :meth:`covariance`."""
         count, d, _ = jacobian.shape
-        elimination = self._factor.elimination
-        # Each block once: the rows of a run share some.
-        block, number = np.unique(self._pattern.place[row], return_inverse=True)
-        number = number.reshape(count, 3) - (block[0] < 0)
-        block = block[block >= 0]
-        columns = np.zeros((elimination.num_blocks, d, len(block), d))
-        columns[block, :, np.arange(len(block))] = np.eye(d)
-        half = self._factor.begun(columns.reshape(elimination.num_blocks * d, -1))
-        whole = np.zeros((count, d, len(block) + 1, d))
+        elimination, place = self._factor.elimination, self._pattern.place[row]
+        columns = np.zeros((elimination.num_blocks, d, count, d))
         for third in range(3):
-            part = jacobian[:, :, third * d : (third + 1) * d]
-            whole[np.arange(count), :, number[:, third]] += part
-        rows = whole[:, :, :-1].reshape(count * d, -1)
-        told = product(half, np.ascontiguousarray(rows.T))
-        return product(told.T, told)
+            has = np.flatnonzero(place[:, third] >= 0)
+            part = jacobian[has, :, third * d : (third + 1) * d]
+            columns[place[has, third], :, has] += part.transpose(0, 2, 1)
+        half = self._factor.begun(columns.reshape(elimination.num_blocks * d, -1))
+        return product(half.T, half)
 
     @property
     def leverage(self) -> np.ndarray:

@@ -21,6 +21,7 @@ from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
 
+_GOOD = 0.5
 # Metres; odometry with a longer step gives no places, so that squares do not overflow.
 _ABSURD = 1e100
 # Odometry gives no places either where the square of its longest step is rounded by more than this, in typical steps
@@ -63,6 +64,13 @@ class Median(NamedTuple):
     memory: PoseMemory
     mode: Mode
     cost: float
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether most closures whose rotations are right join wrong places."""
+        places = self.memory.pose.solved.places
+        is_turned_right = places.rotation_good > _GOOD
+        return 2 * int((is_turned_right & (places.right > _GOOD)).sum()) < int(is_turned_right.sum())
 
 
 def median_poses(graph: ViewGraph, modes: list[Mode], tuned: Callable[[Mode], Mode] = lambda mode: mode) -> Median:

@@ -105,7 +105,7 @@ class Found:
         modes: its modes, in order of increasing F.
         suspected: ``(3,)`` rad, apparent rotation between the axes of closures and odometry, if either may be wrong.
         tilts: nats, −log density of the answer's tilts, by which answers with and without a bias are compared.
-        otherwise: what was found without a bias, or with one, where this has one, or none, and is hardly likelier.
+        otherwise: the likeliest without a bias where this has one, or with one where it has none; None: none was found.
     """
 
     drawn: Drawn
@@ -123,6 +123,11 @@ class Found:
     def total(self) -> float:
         """F of the best mode, and tilts, nats."""
         return self.cost + self.tilts
+
+    @property
+    def is_undecided(self) -> bool:
+        """Whether what was found otherwise is nearly as likely."""
+        return self.otherwise is not None and self.otherwise.total < self.total + _HARDLY
 
     @property
     def calibration(self) -> Calibration | None:
@@ -185,8 +190,7 @@ def search(
         return replace(found, suspected=suspected)
     found, *others = (replace(each, tilts=solver.tilts(each)) for each in (found, as_said, *solver.tried))
     could = (each for each in others if each.is_biased != found.is_biased and not each.is_mounted_nearby)
-    near = [each for each in could if each.total < found.total + _HARDLY]
-    return replace(found, suspected=suspected, otherwise=min(near, key=attrgetter("total"), default=None))
+    return replace(found, suspected=suspected, otherwise=min(could, key=attrgetter("total"), default=None))
 
 
 class _Predicted(NamedTuple):

@@ -16,6 +16,9 @@ from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 from rotavg_ros.evaluation.common.cases import Case
 from rotavg_ros.evaluation.slam import pose_cases
 from rotavg_ros.metrics import orientation_errors
+from rotavg_ros.solver.slam.poses.search import jumps, rivals
+from rotavg_ros.solver.slam.poses.search.jump_witnesses import Jump, Witnesses
+from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import EdgeLabel
@@ -270,3 +273,30 @@ def test_no_step_jumps_farther_than_it_reports() -> None:
     solution = solve(replace(graph, translation=translation))
     assert across.sum() > 20
     assert not warned_of_jumps(solution)
+
+
+@pytest.mark.parametrize("condition", ["jumps", "30 % parallel corridors in runs"])
+def test_jumps_that_cannot_gain_are_not_looked_into(condition: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bound by which they are left out is one, and the jump is that of largest gain among all."""
+    case = case_of(f"building: {pose_cases.JUMPS if condition == 'jumps' else condition}", 5)
+    asked: list[Jump | None] = []
+    likeliest = jumps.likeliest_jump
+
+    def both(pose: PoseMode, at_least: float) -> Jump | None:
+        found = likeliest(pose, at_least)
+        witnesses = Witnesses.of(pose, 12.0)
+        for end in np.flatnonzero(witnesses.is_wrong)[::7]:
+            gain = witnesses.gain_given(int(end))
+            assert (gain <= witnesses.most + 1e-6)[witnesses.is_wrong].all()
+            assert (gain == witnesses.most)[~witnesses.is_wrong].all()
+        of_all = likeliest(pose, -np.inf)
+        if found is None:
+            assert of_all is None or of_all.gained < at_least
+        else:
+            assert of_all is not None and of_all.gained == found.gained and of_all.segment == found.segment
+        asked.append(found)
+        return found
+
+    monkeypatch.setattr(rivals, "likeliest_jump", both)
+    solve(case.graph)
+    assert any(jump is not None for jump in asked) == (condition == "jumps") and None in asked

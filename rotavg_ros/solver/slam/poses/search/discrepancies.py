@@ -11,10 +11,16 @@ from rotavg_ros.solver.slam.poses.solved import PoseMode
 
 def discrepancies(pose: PoseMode, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Covariance ``(K d, K d)`` of the discrepancies of K closures if they are right, and these ``(K d,)``."""
-    problem, solved, k = pose.problem, pose.solved, pose.problem.turns
-    rows, d = problem.mode.problem.closure[members], problem.turns + problem.shifts
-    own = np.repeat(closure_turns(problem, pose.state.noise)[members, None], d, axis=1)
+    problem, solved = pose.problem, pose.solved
+    rows = problem.mode.problem.closure[members]
+    predicted = solved.factor.covariance_between(jacobian(problem, solved.arms)[rows], rows)
+    return predicted + np.diag(own_variances(pose, members).ravel()), solved.predictions.mean[members].ravel()
+
+
+def own_variances(pose: PoseMode, members: np.ndarray) -> np.ndarray:
+    """``(K, d)`` rad² and m², of the own noise of K closures, without what they share with their runs."""
+    problem, k = pose.problem, pose.problem.turns
+    own = np.repeat(closure_turns(problem, pose.state.noise)[members, None], k + problem.shifts, axis=1)
     shared = np.where(problem.run[problem.mode.problem.closure] >= 0, pose.state.noise.common, 0.0)
     own[:, k:] = (stated_variance(problem, pose.state) - shared)[members, None]
-    total = solved.factor.covariance_between(jacobian(problem, solved.arms)[rows], rows) + np.diag(own.ravel())
-    return total, solved.predictions.mean[members].ravel()
+    return own

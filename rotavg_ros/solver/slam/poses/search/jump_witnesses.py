@@ -12,14 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.graph.chain_cuts import connected
 from rotavg_ros.solver.slam.poses.closures import TAILS, given_turn
 from rotavg_ros.solver.slam.poses.em.estimate import judge_of
 from rotavg_ros.solver.slam.poses.repeats.neighbours import log_places
 from rotavg_ros.solver.slam.poses.row_errors import stated_variance
-from rotavg_ros.solver.slam.poses.search.discrepancies import discrepancies
+from rotavg_ros.solver.slam.poses.search.discrepancies import discrepancies, own_variances
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 
 # Shifts agree if they differ by at most this many standard deviations of their uncertainty.
@@ -84,7 +83,8 @@ class Proposal(NamedTuple):
     Attributes:
         end: that end.
         alike, opposite: ``(n,)`` bool, wrong ends that the shift makes right, and those that the opposite one does.
-        gain: ``(n,)`` nats by which wrong ends become likelier then, given this one and those before; others lose it.
+        gain: ``(n,)`` nats by which wrong ends become likelier then, at most, or given this one and those before
+            (:meth:`Witnesses.gain_given`); others lose it.
     """
 
     end: int
@@ -115,6 +115,7 @@ class Witnesses:
         gain: ``(n,)`` nats that a wrong closure gains by becoming right, each by itself, or that a right one loses by
             becoming wrong.
         held: ``(n,)`` nats, log density of each as it is judged, given those before.
+        most: ``(n,)`` nats, upper bound of what each gains given others: where all else predicts it exactly.
         first, last: ``(n,)`` this end is displaced, and the other one not, by jumps in segments first ≤ s < last, if
             other chains rest.
         segment: ``(S,)`` edges of the closure graph.
@@ -135,6 +136,7 @@ class Witnesses:
     is_accepted: np.ndarray
     gain: np.ndarray
     held: np.ndarray
+    most: np.ndarray
     first: np.ndarray
     last: np.ndarray
     segment: np.ndarray
@@ -168,12 +170,15 @@ class Witnesses:
         is_off = np.where(is_accepted, places.chance[TAILS] > _WRONG, ~is_right) & (told.label >= 0)
         spread = np.trace(pose.solved.predictions.covariance[:, problem.turns :, problem.turns :], axis1=1, axis2=2)
         spread = spread / problem.shifts + stated_variance(problem, pose.state)
-        of_closures = spread, is_off, is_accepted, *_gains(pose, is_off)
-        spread, is_off, is_accepted, gain, held = (each[end.closure] for each in of_closures)
+        gain, held = _gains(pose, is_off)
+        highest = -np.log(2 * np.pi * own_variances(pose, np.arange(len(is_off)))).sum(axis=1) / 2
+        most = np.where(is_off, np.maximum(gain, highest - held), gain)
+        of_closures = spread, is_off, is_accepted, gain, held, most
+        spread, is_off, is_accepted, gain, held, most = (each[end.closure] for each in of_closures)
         joining = told.chains[is_right & ~told.is_within & told.is_known]
         prices, variance = np.where(problem.jumps[order] > 0, 0.0, price), problem.could_jump[order]
         ends = end.closure, end.chain, end.other, end.sign, end.shift
-        judged = spread, is_off, is_accepted, gain, held
+        judged = spread, is_off, is_accepted, gain, held, most
         return cls(pose, *ends, *judged, first, place[1], order, begins, prices, variance, joining)
 
     def are_enough(self, ends: np.ndarray) -> bool:
@@ -189,19 +194,16 @@ class Witnesses:
     def proposals(self, end: int) -> list[Proposal]:
         """What one end proposes: that it is displaced; or, between two chains, that what it is judged by is."""
         alike, opposite = self.agreeing(end), self.agreeing(end, -1.0)
-        gain = self._gain_given(end, alike.astype(np.float64) - opposite)
-        found = [Proposal(end, alike, opposite, gain), Proposal(end, opposite, alike, gain)]
+        found = [Proposal(end, alike, opposite, self.most), Proposal(end, opposite, alike, self.most)]
         return found[: 1 + int(self.chain[end] != self.other[end])]
 
-    def _gain_given(self, end: int, sign: np.ndarray) -> np.ndarray:
-        """``(n,)`` nats: gains given what one end, and those before, say of the shift.
+    def gain_given(self, end: int) -> np.ndarray:
+        """``(n,)`` nats: gains given what one end, which keeps its own, and those before say of the shift.
 
         What odometry leaves open of where closures lie they share, whether they are right or repeat wrong places.
-
-        Args:
-            end: it determines the shift, and keeps its gain.
-            sign: ``(n,)`` 1 for ends that agree with it, −1 for those that agree about the opposite shift, else 0.
         """
+        # Ends that agree with it, and those that agree about the opposite shift.
+        sign = self.agreeing(end).astype(np.float64) - self.agreeing(end, -1.0)
         told, shifts, first = self.pose.problem.told, self.pose.problem.shifts, self.closure[end]
         ends = np.flatnonzero((sign != 0) & ~self.is_accepted & (self.closure != first))
         ends = ends[np.argsort(told.detected[self.closure[ends]], kind="stable")][:_MOST_TOGETHER]
@@ -326,40 +328,6 @@ class Witnesses:
         off = np.full(len(variance), np.inf)
         off[could] = square / (2 * variance[could])
         return np.asarray(np.where(price > 0, price + off + width, 0.0))
-
-
-def by_all_else(pose: PoseMode, price: float) -> Jump | None:
-    """The segment that is likeliest to have jumped by what all other rows predict of it; None if none gains by that.
-
-    Odometry beside the chain holds places together across a jump: then all closures fit, and nothing is to be moved.
-
-    Args:
-        pose: poses.
-        price: nats, minus the log prior of one more jump.
-    """
-    problem, solved = pose.problem, pose.solved
-    could = np.flatnonzero((problem.jumps == 0) & (problem.could_jump > 0) & ~problem.slipped)
-    if len(could) == 0:
-        return None
-    others, covariance = solved.factor.without(could)
-    off = np.matmul(others, solved.left[could])[:, :, 0]
-    total = covariance + np.eye(off.shape[1])
-    # A jump's variance, in the units of the whitened row.
-    free = np.zeros((len(could), off.shape[1], problem.shifts))
-    free[:, problem.turns :] = inverse_root(solved.covariance[could][:, ::-1, ::-1])[:, ::-1, ::-1]
-    jumped = total + problem.could_jump[could, None, None] * free @ free.transpose(0, 2, 1)
-    gained = _log_normal(off, jumped) - _log_normal(off, total) - price
-    best = int(np.argmax(gained))
-    if gained[best] < 0:  # no labels change, so there is nothing that the prediction leaves out
-        return None
-    nowhere, none = np.zeros(problem.drawn.num_nodes, dtype=bool), np.zeros(len(problem.closures), dtype=bool)
-    return Jump(int(could[best]), -1, nowhere, np.zeros(3), float(gained[best]), none)
-
-
-def _log_normal(off: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """``(n,)`` nats, log densities of ``(n, d)`` with covariances ``(n, d, d)``, up to a constant."""
-    square = (off * np.linalg.solve(covariance, off[:, :, None])[:, :, 0]).sum(axis=1)
-    return np.asarray(-(square + np.linalg.slogdet(covariance)[1]) / 2)
 
 
 class _Ends(NamedTuple):

@@ -8,13 +8,15 @@ two labellings.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
+from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
-from rotavg_ros.solver.slam.poses.search.jump_witnesses import AS_FAR, Jump, Witnesses, by_all_else
+from rotavg_ros.solver.slam.poses.search.jump_witnesses import AS_FAR, Jump, Place, Proposal, Witnesses
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.labels.prior import log_slip_prior
@@ -33,15 +35,18 @@ def log_jump_prior(problem: PoseProblem) -> float:
     return log_slip_prior(problem.mode.problem, jumped) - float(any_step.sum())
 
 
-def likeliest_jump(pose: PoseMode) -> Jump | None:
-    """The jump of largest predicted gain, by closures that do not fit or by all that does; None if there is none."""
+def likeliest_jump(pose: PoseMode, least: float) -> Jump | None:
+    """The jump of largest predicted gain, by closures that do not fit or by all that does.
+
+    None if there is none that gains at least ``least`` nats.
+    """
     price = _price(pose.problem)
-    told = [jump for jump in (_by_witnesses(pose, price), by_all_else(pose, price)) if jump is not None]
-    return max(told, key=lambda jump: jump.gained, default=None)
+    told = [jump for jump in (_by_witnesses(pose, price, least), _by_all_else(pose, price)) if jump is not None]
+    return max((jump for jump in told if jump.gained >= least), key=lambda jump: jump.gained, default=None)
 
 
-def _by_witnesses(pose: PoseMode, price: float) -> Jump | None:
-    """The likeliest jump by closures; None if none makes at least two right, or an accepted one."""
+def _by_witnesses(pose: PoseMode, price: float, least: float) -> Jump | None:
+    """The likeliest jump by closures; None if none makes at least two right, or an accepted one, and gains that."""
     witnesses = Witnesses.of(pose, price)
     proposers: list[int] = []
     left = witnesses.is_wrong.copy()
@@ -50,16 +55,63 @@ def _by_witnesses(pose: PoseMode, price: float) -> Jump | None:
         proposers.append(int(np.argmax(np.where(left, witnesses.gain, -1.0))))
         left &= ~witnesses.agreeing(proposers[-1])
     proposals = [proposal for each in proposers for proposal in witnesses.proposals(each)]
-    best = _best(witnesses, [witnesses.jump(each, witnesses.place(each)) for each in proposals])
+    best = _best(witnesses, _jumps(witnesses, proposals, witnesses.place, least))
     if best is not None and best.gained > 0:
         return best
-    several = [witnesses.jump(each, witnesses.stretch(each)) for each in proposals[:_STRETCHES]]
+    several = _jumps(witnesses, proposals[:_STRETCHES], witnesses.stretch, least)
     return _best(witnesses, [jump for jump in (best, *several) if jump is not None])
+
+
+def _jumps(
+    witnesses: Witnesses, proposals: list[Proposal], placed: Callable[[Proposal], Place], least: float
+) -> list[Jump]:
+    """The jumps by some shifts, without those that gain less than ``least`` even where every gain is the largest.
+
+    What closures say of each other is a dense solve for each shift.
+    """
+    could = [each for each in proposals if witnesses.jump(each, placed(each)).gained >= least]
+    gain = {end: witnesses.gain_given(end) for end in dict.fromkeys(each.end for each in could)}
+    told = [each._replace(gain=gain[each.end]) for each in could]
+    return [witnesses.jump(each, placed(each)) for each in told]
 
 
 def _best(witnesses: Witnesses, jumps: list[Jump]) -> Jump | None:
     told = [jump for jump in jumps if witnesses.are_enough(jump.freed[witnesses.closure])]
     return max(told, key=lambda jump: jump.gained, default=None)
+
+
+def _by_all_else(pose: PoseMode, price: float) -> Jump | None:
+    """The segment that is likeliest to have jumped by what all other rows predict of it; None if none gains by that.
+
+    Odometry beside the chain holds places together across a jump: then all closures fit, and nothing is to be moved.
+
+    Args:
+        pose: poses.
+        price: nats, minus the log prior of one more jump.
+    """
+    problem, solved = pose.problem, pose.solved
+    could = np.flatnonzero((problem.jumps == 0) & (problem.could_jump > 0) & ~problem.slipped)
+    if len(could) == 0:
+        return None
+    others, covariance = solved.factor.without(could)
+    off = np.matmul(others, solved.left[could])[:, :, 0]
+    total = covariance + np.eye(off.shape[1])
+    # A jump's variance, in the units of the whitened row.
+    free = np.zeros((len(could), off.shape[1], problem.shifts))
+    free[:, problem.turns :] = inverse_root(solved.covariance[could][:, ::-1, ::-1])[:, ::-1, ::-1]
+    jumped = total + problem.could_jump[could, None, None] * free @ free.transpose(0, 2, 1)
+    gained = _log_normal(off, jumped) - _log_normal(off, total) - price
+    best = int(np.argmax(gained))
+    if gained[best] < 0:  # no labels change, so there is nothing that the prediction leaves out
+        return None
+    nowhere, none = np.zeros(problem.drawn.num_nodes, dtype=bool), np.zeros(len(problem.closures), dtype=bool)
+    return Jump(int(could[best]), -1, nowhere, np.zeros(3), float(gained[best]), none)
+
+
+def _log_normal(off: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """``(n,)`` nats, log densities of ``(n, d)`` with covariances ``(n, d, d)``, up to a constant."""
+    square = (off * np.linalg.solve(covariance, off[:, :, None])[:, :, 0]).sum(axis=1)
+    return np.asarray(-(square + np.linalg.slogdet(covariance)[1]) / 2)
 
 
 def _price(problem: PoseProblem) -> float:

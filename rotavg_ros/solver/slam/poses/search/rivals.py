@@ -150,8 +150,8 @@ def _jumping(rival: Rival) -> list[Rival]:
 def _jumping_further(rival: Rival) -> list[Rival]:
     rivals = [rival]
     for _ in range(_MAX_JUMPS):
-        jump = likeliest_jump(rivals[-1].pose)
-        if jump is None or jump.gained < -SLACK:
+        jump = likeliest_jump(rivals[-1].pose, -SLACK)
+        if jump is None:
             break
         rivals.append(settled(*with_jump(rivals[-1].pose, jump)))
         if rivals[-1].cost > rivals[-2].cost:
@@ -162,8 +162,8 @@ def _jumping_further(rival: Rival) -> list[Rival]:
 def _with_jumps(pose: PoseMode) -> PoseMode:
     """Poses with all jumps that are predicted to gain, most variances held at their initial values."""
     for _ in range(_MAX_JUMPS):
-        jump = likeliest_jump(pose)
-        if jump is None or jump.gained < 0:
+        jump = likeliest_jump(pose, 0.0)
+        if jump is None:
             break
         problem, start = with_jump(pose, jump)
         pose = estimate_poses(problem, start=start, ending=Ending(held_for=HELD))
