@@ -247,7 +247,9 @@ def test_few_closures_that_turn_the_answer() -> None:
     # Odometry that does not connect all says nothing of what closures join.
     apart = nine.select_edges(torch.arange(nine.num_edges) != 4)
     (text,) = warnings.of_whole_solve(apart, turned, torch.zeros(apart.num_edges))
-    assert text.startswith("5 of 10 keyframes are joined to the rest by 9 loop closures of a single pair of places")
+    assert text.startswith(
+        "5 of 10 keyframes are joined to the rest by 9 loop closures alone, of a single pair of places"
+    )
 
 
 LAPS = {"a": range(100), "b": range(100, 160), "c": range(160, 200)}
@@ -273,13 +275,17 @@ RUN = tuple((10 + number, 105 + number) for number in range(5))
 def test_robots_that_one_pair_of_places_joins() -> None:
     lone = of_fleet(*RUN)
     (text,) = of_answer(lone)
-    assert text.startswith("60 of 200 keyframes are joined to the rest by 5 loop closures of a single pair of places ")
+    assert text.startswith(
+        "60 of 200 keyframes are joined to the rest by 5 loop closures alone, of a single pair of places, "
+    )
     # A third robot that nothing joins is no part of it; one that hangs on the second moves with it.
     (text,) = of_answer(of_fleet(*RUN, (150, 170), (105, 165)))
-    assert text.startswith("100 of 200 keyframes are joined to the rest by 5 loop closures")
+    assert text.startswith("100 of 200 keyframes are joined to the rest by 5 loop closures alone")
     (text,) = of_answer(of_fleet(*RUN, (150, 170)))
-    assert text.startswith("100 of 200 keyframes are joined to the rest by 6 loop closures of a single pair of places")
-    assert "each alone" in text
+    assert text.startswith(
+        "100 of 200 keyframes are joined to the rest by 6 loop closures alone, of a single pair of places "
+    )
+    assert "places for each part, and" in text
     # Joins elsewhere, at either end, would contradict them.
     for elsewhere in ((80, 107), (12, 155)):
         assert of_answer(of_fleet(*RUN, elsewhere)) == ()

@@ -54,10 +54,11 @@ def lone_places(odometry: Odometry, believed: ViewGraph) -> str | None:
     loose = int(np.bincount(part).sum() - largest.sum())
     closures = int(number[is_lone].sum())
     by = "1 loop closure" if closures == 1 else f"{closures} loop closures"
-    each = "a single pair of places" if is_lone.sum() == 1 else "a single pair of places each"
+    parts = "" if is_lone.sum() == 1 else " for each part"
     return (
-        f"{loose} of {len(part)} keyframes are joined to the rest by {by} of {each} alone, and nothing would "
-        "contradict these if they were false: close a loop elsewhere between them, or check these and accept one"
+        f"{loose} of {len(part)} keyframes are joined to the rest by {by} alone, of a single pair of places{parts}, and "
+        "nothing would contradict these if they were false: close a loop elsewhere between them, or check these and "
+        "accept one"
     )
 
 
