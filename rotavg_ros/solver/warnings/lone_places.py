@@ -56,9 +56,9 @@ def lone_places(odometry: Odometry, believed: ViewGraph) -> str | None:
     by = "1 loop closure" if closures == 1 else f"{closures} loop closures"
     parts = "" if is_lone.sum() == 1 else " for each part"
     return (
-        f"{loose} of {len(part)} keyframes are joined to the rest by {by} alone, of a single pair of places{parts}, and "
-        "nothing would contradict these if they were false: close a loop elsewhere between them, or check these and "
-        "accept one"
+        f"{loose} of {len(part)} keyframes are joined to the rest by {by} alone, of a single pair of places{parts}, "
+        "and nothing would contradict these if they were false: close a loop elsewhere between them, or check these "
+        "and accept one"
     )
 
 
