@@ -67,9 +67,10 @@ class Median(NamedTuple):
 
     @property
     def is_contradicted(self) -> bool:
-        """Whether most closures whose rotations are right join wrong places."""
-        places = self.memory.pose.solved.places
-        is_turned_right = places.rotation_good > _GOOD
+        """Whether most closures of known translations whose rotations are right join wrong places."""
+        pose = self.memory.pose
+        places = pose.solved.places
+        is_turned_right = (places.rotation_good > _GOOD) & pose.problem.told.is_known
         return 2 * int((is_turned_right & (places.right > _GOOD)).sum()) < int(is_turned_right.sum())
 
 
