@@ -100,8 +100,8 @@ def conditioned(
         columns = columns.and_of(linear, edge[some], system.columns(some))
     columns = columns.with_anchors(linear, system.anchors)
     count = len(columns.edge)
-    covariance, residual = system.covariance(columns.covariance, count), system.residual[:count]
     walked = system.walked_to_new(count)
+    covariance, residual = system.covariance(columns.covariance, walked), system.residual[:count]
     rows = system.of_new_nodes(columns, walked)
     odds, rotation_odds = system.log_odds(*Given.none(count, linear.size).left_out(covariance, residual), slice(count))
     given, changes = columns.given.changed_to(covariance, odds > 0)
@@ -248,12 +248,19 @@ class _System:
         """``(n, m, k)`` matrices of v × in the axes of shifts and turns."""
         return np.asarray(np.tensordot(vector, self._crossing, 1))
 
-    def covariance(self, by_columns: np.ndarray, count: int) -> np.ndarray:
-        """``(n, d, n, d)`` S of the first ``count`` closures, given A H⁻¹ Aᵀ ``(n d, n d)``."""
-        d, (k, m) = self.linear.size, self._widths
+    def covariance(self, by_columns: np.ndarray, walked: np.ndarray) -> np.ndarray:
+        """``(n, d, n, d)`` S of the first n closures, given A H⁻¹ Aᵀ ``(n d, n d)`` and :meth:`walked_to_new`."""
+        count, d, (k, m) = walked.shape[2], self.linear.size, self._widths
         between: np.ndarray = by_columns.reshape(count, d, count, d).copy()
         ends = self._ends(count)
-        between += common_walk(self.walk, self._crossing, ends, ends)
+        # What walks with the new nodes at closures' ends walks with closures.
+        for node, sign, lever in zip(ends.node, ends.sign, ends.lever, strict=True):
+            has = np.flatnonzero(node >= self.linear.num_nodes)
+            own = walked[node[has] - self.linear.num_nodes]
+            between[has] += sign * own
+            if m:
+                turned = np.matmul(self._crossed(lever[has]), own[:, :k].reshape(len(has), k, count * d))
+                between[has, k:] += turned.reshape(len(has), m, count, d)
         inside = np.arange(count)
         for axis, kind in enumerate(np.repeat([0, 1], (k, m))):
             between[inside, axis, inside, axis] += self._besides(slice(count))[kind]
