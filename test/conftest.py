@@ -15,7 +15,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-from rotavg_ros.ros.harness.domain import DOMAIN_IDS, free_domain_id
+from rotavg_ros.ros.harness.domain import DOMAIN_IDS, claim_domain_id
 
 # A shell that runs the tests in the background lets its children ignore SIGINT, which the tests send.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -27,11 +27,11 @@ MAX_THREADS = 2
 
 
 def own_domain_id() -> int:
-    """A ROS domain id that is free at the moment; the processes of one test run (pytest-xdist) divide them up."""
+    """A ROS domain id that nobody else uses or claims; the processes of one test run (pytest-xdist) divide them up."""
     run = os.environ.get("PYTEST_XDIST_TESTRUNUID", f"{time.time_ns()} {os.getpid()}")
     worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    return free_domain_id(random.Random(run).sample(DOMAIN_IDS, len(DOMAIN_IDS))[worker::workers])
+    return claim_domain_id(random.Random(run).sample(DOMAIN_IDS, len(DOMAIN_IDS))[worker::workers])
 
 
 # Before anything imports rclpy, and for every process that a test starts: nothing leaves this machine.
@@ -51,7 +51,7 @@ torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else min(MAX_THRE
 
 @pytest.fixture
 def other_domain_id() -> int:
-    """A ROS domain beside the one that the tests use (while something there listens)."""
+    """A ROS domain beside the one that the tests use."""
     return own_domain_id()
 
 

@@ -12,27 +12,53 @@ DOMAIN_IDS = range(1, 102)
 # first (except those confined to this machine), and each of the first few uses one of the others.
 _BASE_PORT, _PORTS_PER_DOMAIN = 7400, 250
 _DISCOVERY_PORTS = (0, 10, 12, 14)
+# The last of a domain's ports: of its 120th participant. Who holds it has the domain, before any participant is there.
+_CLAIM_PORT = _PORTS_PER_DOMAIN - 1
+
+_claims: dict[int, socket.socket] = {}
 
 
-def free_domain_id(candidates: Iterable[int] | None = None) -> int:
-    """The first of the candidates on which no participant of this machine listens at the moment.
+def claim_domain_id(candidates: Iterable[int] | None = None) -> int:
+    """The first of the candidates on which nobody of this machine listens; no other caller gets it from now on.
+
+    The claim ends with this process (and with those that it forks). Participants that are told the domain by hand do
+    not ask for it.
 
     Args:
-        candidates: default: all, in random order, so that two processes that choose at once choose differently.
+        candidates: default: all, in random order.
 
     Raises:
         RuntimeError: all are in use.
     """
     for domain in random.sample(DOMAIN_IDS, len(DOMAIN_IDS)) if candidates is None else candidates:
-        if all(_is_free(_BASE_PORT + _PORTS_PER_DOMAIN * domain + offset) for offset in _DISCOVERY_PORTS):
+        claim = _bound(_port(domain, _CLAIM_PORT))
+        if claim is None:
+            continue
+        if all(_is_free(_port(domain, offset)) for offset in _DISCOVERY_PORTS):
+            _claims[domain] = claim
             return domain
+        claim.close()
     raise RuntimeError("every ROS domain id that may be used is in use on this machine")
 
 
+def _port(domain: int, offset: int) -> int:
+    return _BASE_PORT + _PORTS_PER_DOMAIN * domain + offset
+
+
 def _is_free(port: int) -> bool:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(("", port))
-        except OSError:
-            return False
+    probe = _bound(port)
+    if probe is None:
+        return False
+    probe.close()
     return True
+
+
+def _bound(port: int) -> socket.socket | None:
+    """A socket that alone listens on the port; None if another one does."""
+    listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        listener.bind(("", port))
+    except OSError:
+        listener.close()
+        return None
+    return listener

@@ -18,7 +18,7 @@ from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.live.node_answer import NodeAnswer
-from rotavg_ros.ros.harness.domain import free_domain_id
+from rotavg_ros.ros.harness.domain import claim_domain_id
 from rotavg_ros.ros.harness.recorder import Recorder
 
 _START_TIMEOUT_S = 60.0
@@ -51,7 +51,7 @@ def installed_node() -> Path:
 def keep_to_this_machine() -> None:
     """Let this process and those it starts talk only among themselves: own domain, no network; takes effect once."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
+    os.environ["ROS_DOMAIN_ID"] = str(claim_domain_id())
 
 
 @dataclass(frozen=True)
