@@ -26,6 +26,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rotavg_msgs.msg import AbsoluteOrientations, OutlierFlags, RelativeRotation, RelativeRotationArray
 from std_srvs.srv import Trigger
 
+from rotavg_ros.ros.harness.recorder import is_final
+
 INTERFACES = Path(__file__).resolve().parents[2] / "build" / "test_interfaces" / "install"
 NODE = Path(sys.executable).with_name("rotavg_node")
 STARTUP_SECONDS = 150.0  # far more than needed: a loaded machine must not fail a test
@@ -226,7 +228,7 @@ class LiveNode:
         reports = self.reports
 
         def silent() -> bool:
-            if self.reports < reports + 2 or not self.answers or self.status["answer cold"] != "true":
+            if self.reports < reports + 2 or not self.answers or not is_final(self.status):
                 return False
             if closures is not None and int(self.status["loop closures"]) != closures:
                 return False

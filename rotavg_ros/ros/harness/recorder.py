@@ -20,7 +20,12 @@ _LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durabilit
 _SENSOR = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 # Diagnostic values that stop changing when a node has nothing left to do.
-_AT_REST = ("answer version", "edge messages", "odometry messages", "pending", "ticks")
+_AT_REST = ("answer version", "answer behind", "edge messages", "odometry messages", "pending", "ticks")
+
+
+def is_final(report: dict[str, str]) -> bool:
+    """Whether a node's report says that its answer is a cold one and covers the whole graph."""
+    return report.get("answer cold") == "true" and report.get("answer behind") == "false"
 
 
 class Recorder:
@@ -78,11 +83,15 @@ class Recorder:
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether the last two reports agree that the answer is final and that nothing is coming in."""
+        """Whether the last two reports agree that the answer is final and that nothing is coming in.
+
+        An answer that was final before the last inputs came is behind until the tick with them ends, which takes as
+        long as it takes to compile the solver.
+        """
         if len(self._reports) < 2:
             return False
         before, now = self._reports[-2:]
-        return now.get("answer cold") == "true" and all(before.get(key) == now.get(key) for key in _AT_REST)
+        return is_final(now) and all(before.get(key) == now.get(key) for key in _AT_REST)
 
     def answer(self) -> NodeAnswer | None:
         """The last answer; None if there was none."""

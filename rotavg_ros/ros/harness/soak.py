@@ -23,7 +23,7 @@ from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.evaluation.common.tables import Column, Table
 from rotavg_ros.ros.harness import process_family
 from rotavg_ros.ros.harness.live_run import LiveRunError, installed_node, keep_to_this_machine, stop_process
-from rotavg_ros.ros.harness.recorder import Recorder
+from rotavg_ros.ros.harness.recorder import Recorder, is_final
 from rotavg_ros.ros.node.output.conversions import to_quaternion_message
 from rotavg_ros.view_graph import ViewGraph
 
@@ -156,7 +156,7 @@ def _soak(graph: ViewGraph, load: Load) -> SoakRow:
             time.sleep(_SETTLE_S)
             sender.send_edges_up_to(num_keyframes)
             _wait(recorder, node, lambda report: int(report["keyframes"]) >= num_keyframes, "did not take the graph")
-            before = _wait(recorder, node, lambda report: report["answer cold"] == "true", "did not solve the graph")
+            before = _wait(recorder, node, is_final, "did not solve the graph")
             recorder.forget_reports()
             start, cpu_start = time.monotonic(), process_family.cpu_seconds(node.pid)
             while (elapsed := time.monotonic() - start) < seconds:

@@ -211,6 +211,7 @@ def _values(health: Health, counts: Counts, paused: bool, now: float) -> dict[st
         "answer version": str(0 if answer is None else answer.version),
         "answer age s": "nan" if health.answered is None else f"{now - health.answered:.1f}",
         "answer cold": "nan" if answer is None else str(answer.was_cold).lower(),
+        "answer behind": str(health.unsolved_since is not None).lower(),
         "ticks": str(health.ticks.count),
         "tick p50 ms": f"{health.ticks.percentile_ms(50):.1f}",
         "tick p95 ms": f"{health.ticks.percentile_ms(95):.1f}",

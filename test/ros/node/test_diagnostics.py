@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
+from diagnostic_msgs.msg import DiagnosticStatus
 
 from rotavg_ros.online import KeyframeReference
 from rotavg_ros.online.content import Counts
@@ -49,6 +50,10 @@ def report(health: Health, parameters: NodeParameters | None = None, paused: boo
     return Reporter("rotavg: estimator").report(health, counts, parameters or NodeParameters(), paused)
 
 
+def values_of(status: DiagnosticStatus) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status.values}
+
+
 def test_all_is_well(health: Health) -> None:
     status = report(health, duplicate_edge=4)
     assert (status.level, status.message, status.hardware_id) == (OK, "ok", "cpu")
@@ -80,11 +85,13 @@ def test_an_answer_is_stale_from_the_first_comparison_that_finds_it_behind(healt
     for began in looks:
         health.compared(began, is_behind=True)
     assert health.unsolved_since == looks[0] and "stale by 100 s" in report(health).message
+    assert values_of(report(health))["answer behind"] == "true"
     health.published(answer(seconds=0.1))  # while the third comparison is on its way
     health.compared(looks[1], is_behind=True)
     assert health.unsolved_since == looks[1]
     health.compared(time.monotonic(), is_behind=False)
     assert health.unsolved_since is None and report(health).level == OK
+    assert values_of(report(health))["answer behind"] == "false"
 
 
 @pytest.mark.parametrize(
