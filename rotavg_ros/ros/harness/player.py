@@ -23,7 +23,7 @@ from rotavg_ros.stamps import NANOSECONDS
 # Number of messages that a publisher keeps for retransmission. Fast DDS asks its readers what they lack every 3 s.
 _DEPTH = 10_000
 _ACKNOWLEDGE_TIMEOUT_S = 10.0
-_CLOCK_PERIOD_NS = 10_000_000
+_CLOCK_TOPIC, _CLOCK_PERIOD_NS = "/clock", 10_000_000
 # Subscribers of one process do not appear at once: start when their number has been constant for this long.
 _SETTLE_SECONDS = 0.5
 _CATCH_UP_SECONDS = 0.01
@@ -108,7 +108,7 @@ class _Player:
             durability = DurabilityPolicy.TRANSIENT_LOCAL if bag.is_latched(topic) else DurabilityPolicy.VOLATILE
             qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
             self._publishers[topic] = self.node.create_publisher(message_type, topic, qos)
-        self._clock = self.node.create_publisher(Clock, "/clock", 10) if options.clock else None
+        self._clock = self.node.create_publisher(Clock, _CLOCK_TOPIC, 10) if options.clock else None
         self.counts = dict.fromkeys(types, 0)
 
     def wait_for_subscribers(self) -> None:
@@ -150,9 +150,10 @@ class _Player:
 
     def wait_until_all_is_received(self) -> None:
         deadline = time.monotonic() + _ACKNOWLEDGE_TIMEOUT_S
+        publishers = self._publishers if self._clock is None else {**self._publishers, _CLOCK_TOPIC: self._clock}
         lacking = [
             topic
-            for topic, publisher in self._publishers.items()
+            for topic, publisher in publishers.items()
             if not publisher.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
         ]
         if lacking:
