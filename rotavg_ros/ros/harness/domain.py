@@ -15,8 +15,6 @@ _DISCOVERY_PORTS = (0, 10, 12, 14)
 # The last of a domain's ports: of its 120th participant. Who holds it has the domain, before any participant is there.
 _CLAIM_PORT = _PORTS_PER_DOMAIN - 1
 
-_claims: dict[int, socket.socket] = {}
-
 
 def claim_domain_id(candidates: Iterable[int] | None = None) -> int:
     """The first of the candidates on which nobody of this machine listens; no other caller gets it from now on.
@@ -35,7 +33,7 @@ def claim_domain_id(candidates: Iterable[int] | None = None) -> int:
         if claim is None:
             continue
         if all(_is_free(_port(domain, offset)) for offset in _DISCOVERY_PORTS):
-            _claims[domain] = claim
+            claim.detach()  # nothing closes it but the end of the process
             return domain
         claim.close()
     raise RuntimeError("every ROS domain id that may be used is in use on this machine")

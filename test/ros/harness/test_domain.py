@@ -16,7 +16,10 @@ pytestmark = pytest.mark.ros
 def claimed_by_another_process(candidates: str = "") -> int:
     """The domain that a process gets which asks for one of these and ends."""
     script = f"from rotavg_ros.ros.harness.domain import claim_domain_id; print(claim_domain_id({candidates}))"
-    return int(subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout)
+    command = [sys.executable, "-W", "error", "-c", script]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert ended.stderr == ""  # no warning of a socket that is open at the end
+    return int(ended.stdout)
 
 
 def test_a_node_makes_its_domain_unfree() -> None:
