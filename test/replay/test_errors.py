@@ -19,7 +19,7 @@ from rotavg_ros.bags.messages import odometry_message
 from rotavg_ros.bags.writer import BagWriter
 from rotavg_ros.cli.main import main
 
-ROTAVG = [sys.executable, "-m", "rotavg_ros.cli.main"]
+PATIENCE_S = 300.0
 
 WIND = "geometry_msgs/msg/Vector3Stamped"
 
@@ -336,18 +336,38 @@ def test_no_space_left(tmp_path: Path, small: Path, monkeypatch: pytest.MonkeyPa
     assert not (tmp_path / "out").exists()
 
 
+# A replay that says when it waits for the third message, and waits for ever; the first one has made a keyframe.
+WAITING = """
+import sys, time
+from pathlib import Path
+from rotavg_ros.cli.main import main
+from rotavg_ros.replay import run
+note, waits = Path(sys.argv.pop(1)), []
+def wait(moment, stop):
+    waits.append(moment)
+    if len(waits) == 3:
+        note.touch()
+        while not stop():
+            time.sleep(0.01)
+run._wait_until = wait
+sys.exit(main())
+"""
+
+
 def interrupt_replay(bag: Path, output: Path, number: signal.Signals, *options: str) -> tuple[int, str, str]:
     """Begin to replay, and send a signal in the middle; the exit code and what was told."""
-    command = [*ROTAVG, "replay", str(bag), "--output", str(output), "--rate", "0.05", "--no-report", *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
-    while not list(output.glob(f".unfinished.{process.pid}/.run.unfinished")):  # the recording has begun
-        assert process.poll() is None, process.stderr
+    note = output.with_name("waiting")
+    command = [sys.executable, "-c", WAITING, str(note), "replay", str(bag), "--output", str(output), "--rate", "1"]
+    process = subprocess.Popen(
+        [*command, "--no-report", *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + PATIENCE_S
+    while not note.exists():
+        assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.1)
-    time.sleep(1)  # the first message makes the first keyframe
     process.send_signal(number)
-    told, complaints = process.communicate(timeout=300)
+    told, complaints = process.communicate(timeout=PATIENCE_S)
     return process.returncode, told, complaints
 
 
