@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from types import SimpleNamespace
 
@@ -34,6 +35,13 @@ def answer(**changes: object) -> SimpleNamespace:
         "warnings": (),
     }
     return SimpleNamespace(**values | changes)
+
+
+@pytest.fixture(autouse=True)
+def _a_millisecond_a_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However long this process waits for a core."""
+    begin, looks = time.monotonic(), itertools.count()
+    monkeypatch.setattr(time, "monotonic", lambda: begin + 1e-3 * next(looks))
 
 
 @pytest.fixture
