@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import subprocess
 import sys
@@ -61,17 +60,18 @@ def start(live_node, *parameters: str) -> None:
 
 def until_heard(live_node, passed: list, publish) -> None:
     """Send odometry, which goes on at once, until the node has found who listens to what it sends on."""
-    numbers = itertools.count(1000)
+    step = closure(0, False)
+    step.id, step.kind = 1000, RelativeRotation.ODOMETRY
 
     def is_heard() -> bool:
-        step = closure(0, False)
-        step.id, step.kind = next(numbers), RelativeRotation.ODOMETRY
+        step.id += 1
         publish(step)
         live_node.spin_for(0.2)
         return bool(passed)
 
     live_node.spin_until(is_heard)
-    live_node.spin_for(0.5)
+    # Several are under way where the node is slow.
+    live_node.spin_until(lambda: any(edge.id == step.id for each in passed for edge in getattr(each, "edges", [each])))
     passed.clear()
 
 
