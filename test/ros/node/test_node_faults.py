@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import random
@@ -292,17 +293,19 @@ def test_a_flood_is_survived_and_every_loss_counted(live_node) -> None:
     messages = [odometry(index) for index in range(sent)]
     for message in messages:
         live_node.odometry.publish(message)
-    # The last number tells what is missing before it, so send until one gets through after the flood.
-    ahead = sent
-    live_node.spin_for(2.0)
-    live_node.odometry.publish(odometry(ahead))
-    live_node.spin_for(2.0)
+    late = itertools.count(1)
 
-    def accounted() -> int:
-        status = live_node.status
-        return int(status["odometry messages"]) + int(status["lost messages"]) + int(status["missed before first"])
+    def all_are_accounted_for() -> bool:
+        """The last number tells what is missing before it, so send until one gets through after the flood."""
+        number = next(late)
+        live_node.spin_for(1.0)
+        live_node.odometry.publish(odometry(sent + number))
+        reports = live_node.reports
+        live_node.spin_until(lambda: live_node.reports >= reports + 2)
+        counts = ("odometry messages", "lost messages", "missed before first")
+        return sum(int(live_node.status[name]) for name in counts) == sent + number
 
-    live_node.spin_until(lambda: accounted() == sent + 1)
+    live_node.spin_until(all_are_accounted_for)
     assert int(live_node.status["ticks"]) > 0
 
 
