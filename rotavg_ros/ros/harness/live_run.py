@@ -21,8 +21,9 @@ from rotavg_ros.evaluation.live.node_answer import NodeAnswer
 from rotavg_ros.ros.harness.domain import claim_domain_id
 from rotavg_ros.ros.harness.recorder import Recorder
 
-_START_TIMEOUT_S = 60.0
-_REST_TIMEOUT_S = 180.0
+# Seconds, on a machine that is slow or busy: the first answer alone may take 300, once on a machine, for compiling.
+_START_TIMEOUT_S = 150.0
+_REST_TIMEOUT_S = 600.0
 _EXIT_TIMEOUT_S = 10.0
 
 

@@ -17,7 +17,7 @@ from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig,
 pytestmark = pytest.mark.ros
 
 ROTAVG = [sys.executable, "-m", "rotavg_ros.cli.main"]
-PATIENCE_S = 180.0
+PATIENCE_S = 900.0  # 120 s were taken beside five busy processes
 
 
 def test_a_simulated_run(tmp_path: Path, start_process: Callable) -> None:
