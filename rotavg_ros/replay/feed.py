@@ -48,11 +48,10 @@ class Feed:
         self._generation = estimator.generation
         self._edge_converters: list[EdgeConverter] = []
         self._handlers: dict[str, list[Callable[[Any], None]]] = {}
-        parameters = plan.parameters
-        for robot, source, sensor in zip(parameters.robots, plan.odometry, parameters.odometry_sensors(), strict=False):
+        for robot, source, sensor in plan.odometry_of_robots():
             odometry = partial(self._take_odometry, robot, ODOMETRY_CONVERTERS[source.type_name], sensor)
             self._handlers.setdefault(source.topic, []).append(odometry)
-        for source, about in zip(plan.edges, parameters.edge_sources(), strict=True):
+        for source, about in zip(plan.edges, plan.parameters.edge_sources(), strict=True):
             convert = EDGE_CONVERTERS[source.type_name](about.into(estimator))
             self._edge_converters.append(convert)
             edges = partial(self._take_edges, convert, source.topic)

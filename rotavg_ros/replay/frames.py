@@ -26,8 +26,7 @@ class BagFrames:
         self._unlike: str | None = None
         for _, _, message in bag.decoded(static_transforms(bag.topics) if self._is_on else []):
             self._sensors.take(message)
-        parameters = plan.parameters
-        for robot, source, sensor in zip(parameters.robots, plan.odometry, parameters.odometry_sensors(), strict=False):
+        for robot, source, sensor in plan.odometry_of_robots():
             frame = _frame_of_body(bag, source, sensor) if self._is_on else ""
             self._sensors.note_body(robot, frame, sensor)
             self._bodies |= {frame} if frame else set()

@@ -13,6 +13,7 @@ from rotavg_ros.bags.topics import static_transforms
 from rotavg_ros.datasets.files.pose_files import read_pose_file
 from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
+from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.replay.pace import Pace, WorkRates
 from rotavg_ros.replay.record import TopicUse
 from rotavg_ros.replay.topics import Candidate, Candidates, can_be_read_as, find_candidates
@@ -20,7 +21,7 @@ from rotavg_ros.settings.parameters import NodeParameters
 
 # Parameters that name topics, and for each the parameters with values per topic, with the number of values.
 _PER_TOPIC = {
-    "odometry_topics": {"robots": 1, "odometry_sensor_orientations": 4},
+    "odometry_topics": {"odometry_sensor_orientations": 4},
     "edge_topics": {"edge_robots": 1, "edge_sensor_orientations": 4},
 }
 
@@ -64,8 +65,8 @@ class Plan:
     """All decisions about a replay.
 
     Attributes:
-        parameters: the node's, with the bag's topics; ``odometry_topics`` may name one that the bag lacks.
-        odometry: one per robot, in the order of ``parameters.robots``; empty if the bag has no odometry.
+        parameters: the node's, with the bag's topics; ``odometry_topics`` may name some that the bag lacks.
+        odometry: those of ``parameters.odometry_topics`` that the bag has, in that order.
         edges: in the order of ``parameters.edge_topics``.
         references: topic or file by robot.
         topics: every topic of the bag and its use.
@@ -86,6 +87,12 @@ class Plan:
     @property
     def has_input(self) -> bool:
         return bool(self.odometry or self.edges)
+
+    def odometry_of_robots(self) -> list[tuple[str, Input, Quaternion]]:
+        """The robots whose odometry the bag has, with its topic and body_from_sensor."""
+        recorded, parameters = {_entry(source): source for source in self.odometry}, self.parameters
+        rows = zip(parameters.robots, parameters.odometry_topics, parameters.odometry_sensors(), strict=True)
+        return [(robot, recorded[entry], sensor) for robot, entry, sensor in rows if entry in recorded]
 
     def pace(self) -> Pace:
         """When there are ticks, from the first message on."""
@@ -113,33 +120,37 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
     unused = tuple(name for name in _OF_LIVE_NODES if values.get(name, defaults[name]) != defaults[name])
     values = {name: value for name, value in values.items() if name not in _OF_LIVE_NODES}
     values = _without_absent_topics(bag, values)
-    odometry = _odometry(bag, found, wishes.odometry or values.get("odometry_topics"))
+    odometry = _odometry(bag, found, wishes.odometry, values.get("odometry_topics", ()))
     edges = _edges(bag, found, wishes.edges or values.get("edge_topics"))
     settings = dict(values)
-    settings["robots"] = _robots(wishes.robots or values.get("robots"), odometry)
-    if odometry:
-        settings["odometry_topics"] = tuple(f"{topic}:{type_name}" for topic, type_name in odometry)
-    settings["edge_topics"] = tuple(f"{topic}:{type_name}" for topic, type_name in edges)
+    topics = _odometry_topics(odometry, () if wishes.odometry else values.get("odometry_topics", ()))
+    settings["robots"] = robots = _robots(wishes.robots or values.get("robots"), topics)
+    if not odometry and len(topics) != len(robots):
+        topics = tuple(f"/{robot}/odom" for robot in robots)  # the bag has none, whatever its name
+    settings["odometry_topics"] = topics
+    settings["edge_topics"] = tuple(map(_entry, edges))
     if found.brings_keyframes and edges:
         settings.setdefault("keyframe_source", "edges")
     elif edges and not odometry:
         settings.setdefault("unknown_keyframes", "create")
     parameters = NodeParameters().changed(settings)
-    references = _references(bag, found, wishes.references, parameters.robots, odometry)
     from_tf = parameters.edge_frames_from_tf and "edge_sensor_orientations" not in values
     tick_work = None if "solve_period_s" in values else WorkRates()
-    plan = Plan(parameters, odometry, edges, references, (), from_tf, tick_work, unused)
+    plan = Plan(parameters, odometry, edges, {}, (), from_tf, tick_work, unused)
+    plan = replace(plan, references=_references(bag, found, wishes.references, plan))
     return replace(plan, topics=_uses(bag, found, plan))
 
 
 def _without_absent_topics(bag: BagReader, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters restricted to topics that the bag has; if it has none of them, the topics are guessed."""
+    """The parameters restricted to topics that the bag has; if it has none of them, the topics are guessed.
+
+    Of several robots none is left out, since messages may mean their places among all: their topics stay as they are.
+    """
     recorded, kept = bag.topics, dict(values)
     for topics, lists in _PER_TOPIC.items():
         entries = values.get(topics, ())
-        names = [entry.partition(":")[0] for entry in entries]
-        present = [index for index, name in enumerate(names) if name in recorded or f"/{name.lstrip('/')}" in recorded]
-        if len(present) == len(entries):
+        present = [index for index, entry in enumerate(entries) if _is_recorded(entry, recorded)]
+        if len(present) == len(entries) or (topics == "odometry_topics" and len(entries) > 1):
             continue
         kept[topics] = tuple(entries[index] for index in present) or None
         for name, width in lists.items():
@@ -151,10 +162,34 @@ def _without_absent_topics(bag: BagReader, values: Mapping[str, Any]) -> dict[st
     return {name: value for name, value in kept.items() if value is not None}
 
 
-def _odometry(bag: BagReader, found: Candidates, wanted: Sequence[str] | None) -> tuple[Input, ...]:
+def _is_recorded(entry: str, recorded: Mapping[str, str]) -> bool:
+    name = entry.partition(":")[0]
+    return name in recorded or f"/{name.lstrip('/')}" in recorded
+
+
+def _entry(source: Input) -> str:
+    """As the node's parameters name a topic."""
+    return f"{source.topic}:{source.type_name}"
+
+
+def _odometry(
+    bag: BagReader, found: Candidates, wanted: Sequence[str] | None, listed: Sequence[str]
+) -> tuple[Input, ...]:
+    """The topics wanted, else those of the node's list that the bag has, else the best."""
+    recorded = bag.topics
+    if wanted is None and listed:
+        wanted = [entry for entry in listed if _is_recorded(entry, recorded)]
     if wanted is None:
         return tuple(Input(best.topic, best.type_name) for best in found.odometry[:1])
     return _chosen(bag, wanted, ODOMETRY_CONVERTERS, "odometry", found.odometry)
+
+
+def _odometry_topics(odometry: Sequence[Input], listed: Sequence[str]) -> tuple[str, ...]:
+    """The node's list with these in their places; only these where it has no list."""
+    entry_of = {source.topic.lstrip("/"): _entry(source) for source in odometry}
+    if not listed:
+        return tuple(entry_of.values())
+    return tuple(entry_of.get(entry.partition(":")[0].lstrip("/"), entry) for entry in listed)
 
 
 def _edges(bag: BagReader, found: Candidates, wanted: Sequence[str] | None) -> tuple[Input, ...]:
@@ -192,28 +227,25 @@ def _chosen(
     return tuple(inputs)
 
 
-def _robots(wanted: Sequence[str] | None, odometry: Sequence[Input]) -> tuple[str, ...]:
+def _robots(wanted: Sequence[str] | None, entries: Sequence[str]) -> tuple[str, ...]:
     """Names for the robots of the odometry topics: as given, or their topics' namespaces, or the default for one."""
     if wanted:
         return tuple(wanted)
-    if len(odometry) < 2:
+    if len(entries) < 2:
         return NodeParameters().robots
-    namespaces = [source.topic.strip("/").rpartition("/")[0] for source in odometry]
-    names = namespaces if len(set(namespaces)) == len(odometry) and all(namespaces) else None
-    return tuple(names or (source.topic.strip("/") for source in odometry))
+    topics = [entry.partition(":")[0].strip("/") for entry in entries]
+    namespaces = [topic.rpartition("/")[0] for topic in topics]
+    names = namespaces if len(set(namespaces)) == len(topics) and all(namespaces) else None
+    return tuple(names or topics)
 
 
-def _references(
-    bag: BagReader,
-    found: Candidates,
-    wanted: Sequence[str] | None,
-    robots: Sequence[str],
-    odometry: Sequence[Input],
-) -> dict[str, Input | Path]:
+def _references(bag: BagReader, found: Candidates, wanted: Sequence[str] | None, plan: Plan) -> dict[str, Input | Path]:
+    robots = plan.parameters.robots
     if wanted is None:
-        used = {source.topic for source in odometry}
+        used = {source.topic for source in plan.odometry}
         best = next((candidate for candidate in found.references if candidate.topic not in used), None)
-        return {robots[0]: Input(best.topic, best.type_name)} if best and len(robots) == 1 else {}
+        known = robots if len(robots) == 1 else [robot for robot, _, _ in plan.odometry_of_robots()]
+        return {known[0]: Input(best.topic, best.type_name)} if best and len(known) == 1 else {}
     if list(wanted) == ["none"]:
         return {}
     if len(wanted) > len(robots):
@@ -237,7 +269,7 @@ def _references(
 def _uses(bag: BagReader, found: Candidates, plan: Plan) -> tuple[TopicUse, ...]:
     """Every topic of the bag, and its use in the plan."""
     roles: dict[str, list[str]] = {}
-    for robot, source in zip(plan.parameters.robots, plan.odometry, strict=False):
+    for robot, source, _ in plan.odometry_of_robots():
         roles.setdefault(source.topic, []).append(f"odometry of {robot}")
     for source in plan.edges:
         brings = plan.parameters.estimator.keyframe_source == "edges"

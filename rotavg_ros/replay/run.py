@@ -136,7 +136,7 @@ def replay(
         raise BagReadError(damage)
     if answer is None:
         raise ReplayError(f"{bag.path}: {_why_nothing(plan, estimator.counts())}")
-    waiting = left_waiting.told(estimator.counts(), plan.parameters.robots)
+    waiting = left_waiting.told(estimator.counts(), _robots_with_odometry(plan))
     return Outcome(
         estimator,
         answer,
@@ -263,11 +263,15 @@ def _wait_until(moment: float, stop: Callable[[], bool]) -> None:
         time.sleep(min(left, _NAP_S))
 
 
+def _robots_with_odometry(plan: Plan) -> list[str]:
+    return [robot for robot, _, _ in plan.odometry_of_robots()]
+
+
 def _why_nothing(plan: Plan, counts: Counts) -> str:
     topics = ", ".join(source.topic for source in (*plan.odometry, *plan.edges))
     refused = ", ".join(f"{count} × {reason}" for reason, count in counts.rejected.items() if count)
     waiting = None if plan.odometry else _without_odometry(plan, counts)
-    waiting = waiting or left_waiting.told(counts, plan.parameters.robots)
+    waiting = waiting or left_waiting.told(counts, _robots_with_odometry(plan))
     why = [f"refused: {refused}"] if refused else []
     why += [waiting] if waiting else []
     why = why or ["none of their messages lies in the replayed part"]

@@ -145,10 +145,40 @@ def test_a_node_listens_to_more_than_was_recorded(plan_for) -> None:
         "robots": ("red", "blue"),
         "odometry_topics": ("red/odom", "blue/odom"),
     }
-    plan = plan_for({"/blue/odom": ODOM, "/camera": CLOSURE}, values=values)
-    assert plan.parameters.robots == ("blue",)
+    plan = plan_for({"/blue/odom": ODOM, "/camera": CLOSURE, "/blue/gt": ODOM}, values=values)
     (source,) = plan.parameters.edge_sources()
     assert (source.robot, source.body_from_sensor) == ("blue", turned)
+    assert roles(plan)["/blue/odom"] == "odometry of blue" and roles(plan)["/blue/gt"] == "reference for blue"
+
+
+@pytest.mark.parametrize("recorded", [["/red/odom", "/blue/odom"], ["/blue/odom"], []])
+def test_robots_keep_their_numbers_where_their_odometry_was_not_recorded(plan_for, recorded: list[str]) -> None:
+    """Messages number them, and edges that name none are the first one's: as in the node."""
+    turned = (0.0, 0.0, 1.0, 0.0)
+    values = {
+        "robots": ("red", "blue"),
+        "odometry_topics": ("red/odom", "blue/odom"),
+        "odometry_sensor_orientations": (*IDENTITY.tolist(), *turned),
+        "keyframe_source": "edges",
+    }
+    plan = plan_for(dict.fromkeys(recorded, ODOM) | {"/edges": STEP, "/imu": GOOD_IMU}, values=values)
+    assert plan.parameters.robots == ("red", "blue")
+    (source,) = plan.parameters.edge_sources()
+    assert (source.robot, source.robot_of(0), source.robot_of(1)) == ("red", "red", "blue")
+    sensors = {"red": tuple(IDENTITY), "blue": turned}
+    odometry = plan.odometry_of_robots()
+    assert [(source.topic, sensor) for _, source, sensor in odometry] == [
+        (topic, sensors[topic.split("/")[1]]) for topic in recorded
+    ]
+
+
+def test_robots_can_be_named_without_any_odometry(plan_for) -> None:
+    plan = plan_for({"/edges": STEP}, robots=["red", "blue"])
+    assert plan.parameters.robots == ("red", "blue") and plan.odometry_of_robots() == []
+    named = plan_for({"/edges": STEP, "/imu": GOOD_IMU}, robots=["red", "blue"], odometry=["none"])
+    assert named.parameters.robots == ("red", "blue") and named.odometry_of_robots() == []
+    one = plan_for({"/odom": ODOM}, values={"robots": ("rover",), "odometry_topics": ("wheels",)})
+    assert roles(one) == {"/odom": "odometry of rover"}
 
 
 def test_the_nodes_own_parameter_file(tmp_path: Path) -> None:
