@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -132,6 +133,46 @@ def test_the_front_end_chooses_the_keyframes(solver):
     assert answer.edge_id.tolist() == [10, 20, 0, 30]
     np.testing.assert_allclose(answer.world_from_body[0], run.odometry[0].as_quat(canonical=True), atol=1e-12)
     np.testing.assert_allclose(estimator.current_orientation("r"), run.odometry[39].as_quat(canonical=True), atol=1e-12)
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+def test_a_front_ends_edges_may_come_in_any_order(solver, numbered):
+    """A closure by stamp may come before the keyframes of those moments, whether these have ids or stamps alone."""
+
+    def keyframe(number):
+        return KeyframeReference("r", number if numbered else None, (number + 1) * SECOND)
+
+    quarter = [0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
+    pairs = [(keyframe(number), keyframe(number + 1)) for number in range(3)]
+    edges = [EdgeMeasurement(row, *pair, quarter, EdgeKind.ODOMETRY) for row, pair in enumerate(pairs)]
+    ends = (KeyframeReference("r", stamp_ns=moment * SECOND) for moment in (1, 4))
+    edges.append(EdgeMeasurement(3, *ends, [0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5)]))
+    for order in permutations(edges):
+        estimator = OnlineEstimator(EstimatorOptions(keyframe_source="edges"), solver)
+        assert [estimator.add_edge(edge) for edge in order] == [None] * 4
+        snapshot = estimator.snapshot()
+        stamps = snapshot.stamp_ns[np.stack((snapshot.graph.source, snapshot.graph.target), axis=1)] // SECOND
+        assert dict(zip(snapshot.edge_id.tolist(), stamps.tolist(), strict=True)) == {
+            0: [1, 2],
+            1: [2, 3],
+            2: [3, 4],
+            3: [1, 4],
+        }
+
+
+def test_a_closure_waits_for_a_keyframe_whose_stamp_comes_later(solver):
+    """Odometry that is sent again with the stamps that it lacked tells when its keyframes were."""
+    estimator = OnlineEstimator(EstimatorOptions(keyframe_source="edges"), solver)
+    step = EdgeMeasurement(
+        0, KeyframeReference("r", 5), KeyframeReference("r", 6), [0.0, 0.0, 0.0, 1.0], EdgeKind.ODOMETRY
+    )
+    estimator.add_edge(step)
+    ends = (KeyframeReference("r", stamp_ns=moment * SECOND) for moment in (1, 2))
+    estimator.add_edge(EdgeMeasurement(1, *ends, [0.0, 0.0, 0.0, 1.0]))
+    assert estimator.counts().pending == 1
+    source, target = (replace(end, stamp_ns=moment * SECOND) for end, moment in ((step.source, 1), (step.target, 2)))
+    estimator.add_edge(replace(step, source=source, target=target))
+    assert estimator.counts().pending == 0 and estimator.counts().edges == 2
 
 
 def test_unknown_keyframes_may_be_created(solver):

@@ -168,6 +168,7 @@ class EdgePlacement:
             if graph.node(end.robot, end.keyframe_id) is not None:
                 time_line = self._growth.time_line_of(end.robot, end.stamp_ns)
                 graph.add_keyframe(end.robot, end.keyframe_id, end.stamp_ns, time_line)
+                self._place_waiting(end.robot, end.keyframe_id, end.stamp_ns)
 
     def _create_keyframes(self, edge: EdgeMeasurement) -> None:
         """Create the keyframes that the edge names, where edges may do so."""
@@ -188,9 +189,15 @@ class EdgePlacement:
             if is_new and (was_there or not growth.has_room_for_keyframe()):
                 continue
             growth.graph.add_keyframe(end.robot, keyframe_id, stamp_ns, time_line)
-            self.place_all(growth.pending.pop_keyframe(end.robot, keyframe_id))
+            self._place_waiting(end.robot, keyframe_id, stamp_ns)
         if chosen_by_front_end:
             self._advance_data_time(edge)
+
+    def _place_waiting(self, robot: str, keyframe_id: int, stamp_ns: int) -> None:
+        """Take the edges that waited for a keyframe by its id or by its moment."""
+        pending = self._growth.pending
+        self.place_all(pending.pop_keyframe(robot, keyframe_id))
+        self.place_all(pending.pop_moment(robot, stamp_ns))
 
     def _advance_data_time(self, edge: EdgeMeasurement) -> None:
         """Advance the time of each robot that an edge is about, once: an edge alone does not confirm its stamps."""

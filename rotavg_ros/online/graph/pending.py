@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right, insort
+from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -119,6 +119,12 @@ class PendingEdges:
     def pop_keyframe(self, robot: str, keyframe_id: int) -> list[EdgeMeasurement]:
         """Take out the edges that wait for a keyframe."""
         return [self._remove(serial) for serial in list(self._by_keyframe.get((robot, keyframe_id), ()))]
+
+    def pop_moment(self, robot: str, stamp_ns: int) -> list[EdgeMeasurement]:
+        """Take out the edges that wait for exactly this moment of a robot."""
+        stamps = self._by_stamp.get(robot, [])
+        first, behind = bisect_left(stamps, (stamp_ns, 0)), bisect_right(stamps, (stamp_ns, self._serial))
+        return [self._remove(serial) for _, serial in stamps[first:behind]]
 
     def pop_until(self, robot: str, stamp_ns: int) -> list[EdgeMeasurement]:
         """Take out the edges that wait for a moment of a robot not later than the stamp."""
