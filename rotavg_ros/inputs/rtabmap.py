@@ -1,7 +1,8 @@
 """RTAB-Map's graph, ``rtabmap_msgs/MapGraph``: whole in every message, but optimisation may leave out nodes.
 
 Facts from the package's message definitions and from ``rtabmap/core/Link.h``: a link's transform is the pose of
-``to_id`` in the frame of ``from_id``, its matrix is information, not covariance, and nodes carry no stamps.
+``to_id`` in the frame of ``from_id``, its matrix is information, not covariance, and nodes carry no stamps. ROS 1
+writes the same fields as ``toId``, ``fromId`` and ``posesId``.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ class MapGraphConverter(ForeignGraph):
         if _KIND.get(edge.type) != EdgeKind.LOOP_CLOSURE:
             return None
         robot = self._source.robot
-        return robot, edge_id_of((robot, int(edge.from_id)), (robot, int(edge.to_id)), EdgeKind.LOOP_CLOSURE)
+        source, target = _ends(edge)
+        return robot, edge_id_of((robot, source), (robot, target), EdgeKind.LOOP_CLOSURE)
 
     def __call__(self, message: Any) -> Iterator[EdgeRecord]:
         robot = self._source.robot
@@ -42,13 +44,15 @@ class MapGraphConverter(ForeignGraph):
         except RejectedInputError as rejection:
             yield EdgeRecord(rejection.reason)
             return
-        if len(message.poses_id):
+        nodes = _field(message, "poses_id", "posesId")
+        if len(nodes):
             # The newest node is the frame that the message was published for.
-            self._note_stamp((robot, int(max(message.poses_id))), stamp_ns, is_its_own=False)
+            self._note_stamp((robot, int(max(nodes))), stamp_ns, is_its_own=False)
         links, unknown = edges_in_order(message.links, _KIND, _NO_EDGES)
         for link in links:
+            source, target = _ends(link)
             yield from self._edges(
-                ((robot, int(link.from_id)), (robot, int(link.to_id))),
+                ((robot, source), (robot, target)),
                 link.transform.rotation,
                 link.transform.translation,
                 _KIND[link.type],
@@ -56,3 +60,12 @@ class MapGraphConverter(ForeignGraph):
             )
         for _ in range(unknown):
             yield EdgeRecord(RejectReason.BAD_KIND)
+
+
+def _ends(link: Any) -> tuple[int, int]:
+    """Ids of a link's source and target."""
+    return int(_field(link, "from_id", "fromId")), int(_field(link, "to_id", "toId"))
+
+
+def _field(message: Any, name: str, in_ros1: str) -> Any:
+    return getattr(message, name if hasattr(message, name) else in_ros1)

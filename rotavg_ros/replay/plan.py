@@ -12,7 +12,7 @@ from rotavg_ros.bags.reader import RECORDING_SUFFIXES, BagReader
 from rotavg_ros.bags.topics import static_transforms
 from rotavg_ros.datasets.files.pose_files import read_pose_file
 from rotavg_ros.errors import UserError, asking_about
-from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
+from rotavg_ros.inputs import BRINGS_KEYFRAMES, EDGE_CONVERTERS, ODOMETRY_CONVERTERS
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.replay.pace import Pace, WorkRates
 from rotavg_ros.replay.record import TopicUse
@@ -129,7 +129,7 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
         topics = tuple(f"/{robot}/odom" for robot in robots)  # the bag has none, whatever its name
     settings["odometry_topics"] = topics
     settings["edge_topics"] = tuple(map(_entry, edges))
-    if found.brings_keyframes and edges:
+    if any(edge.topic in found.brings_keyframes or edge.type_name in BRINGS_KEYFRAMES for edge in edges):
         settings.setdefault("keyframe_source", "edges")
     elif edges and not odometry:
         settings.setdefault("unknown_keyframes", "create")
@@ -194,7 +194,7 @@ def _odometry_topics(odometry: Sequence[Input], listed: Sequence[str]) -> tuple[
 
 def _edges(bag: BagReader, found: Candidates, wanted: Sequence[str] | None) -> tuple[Input, ...]:
     if wanted is None:
-        return tuple(Input(edge.topic, edge.type_name) for edge in found.edges)
+        wanted = [edge.topic for edge in found.edges]
     return _chosen(bag, wanted, EDGE_CONVERTERS, "relative rotations", found.edges)
 
 
@@ -221,8 +221,13 @@ def _chosen(
                 f"{bag.path}: {topic} is {type_name}, of which no {what} can be made; candidates: {names}; "
                 f"types: {', '.join(converters)}"
             )
-        if type_name != recorded[topic] and not can_be_read_as(bag, topic, type_name):
-            raise PlanError(f"{bag.path}: {topic} is {recorded[topic]} and cannot be read as {type_name}")
+        if not can_be_read_as(bag, topic, type_name):
+            if type_name != recorded[topic]:
+                raise PlanError(f"{bag.path}: {topic} is {recorded[topic]} and cannot be read as {type_name}")
+            raise PlanError(
+                f"{bag.path}: {topic} is {type_name}, in a version with other fields than those that rotavg knows; "
+                "name other topics, or none (--edges, --odometry)"
+            )
         inputs.append(Input(topic, type_name))
     return tuple(inputs)
 

@@ -45,14 +45,14 @@ class Candidates:
         odometry: topics that could serve as odometry.
         references: topics to compare with: ground truth, then poses, then IMUs.
         edges: topics with relative rotations.
-        brings_keyframes: whether the edges' sender chooses the keyframes.
+        brings_keyframes: topics of edges whose sender chooses the keyframes.
         why_not: by topic, why one that looks useful is not.
     """
 
     odometry: tuple[Candidate, ...]
     references: tuple[Candidate, ...]
     edges: tuple[Candidate, ...]
-    brings_keyframes: bool
+    brings_keyframes: frozenset[str]
     why_not: dict[str, str] = field(default_factory=dict)
 
 
@@ -82,7 +82,9 @@ def find_candidates(bag: BagReader) -> Candidates:
             sorted((pose for pose in poses if pose.is_truth or pose.type_name != _ODOMETRY), key=_as_reference)
         ),
         edges=tuple(edges),
-        brings_keyframes=any(edge.type_name in BRINGS_KEYFRAMES or _has_odometry_edges(bag, edge) for edge in edges),
+        brings_keyframes=frozenset(
+            edge.topic for edge in edges if edge.type_name in BRINGS_KEYFRAMES or _has_odometry_edges(bag, edge)
+        ),
         why_not=why_not,
     )
 
@@ -108,14 +110,15 @@ def _states_orientation(bag: BagReader, candidate: Candidate) -> bool:
 
 
 def can_be_read_as(bag: BagReader, topic: str, type_name: str) -> bool:
-    """Whether the first messages of a topic have the fields of another type, as those of a renamed package do."""
+    """Whether a topic's messages have the fields of a type, as those of a renamed package do, judged by the first."""
     for _, _, message in islice(bag.decoded([topic]), _FIRST_EDGES):
         try:
             if type_name in ODOMETRY_CONVERTERS:
                 with suppress(RejectedInputError):
                     ODOMETRY_CONVERTERS[type_name](message, IDENTITY)
-            else:
-                list(EDGE_CONVERTERS[type_name](Source("robot"))(message))
+                return True
+            if next(EDGE_CONVERTERS[type_name](Source("robot"))(message), None) is not None:
+                return True
         except (AttributeError, TypeError):
             return False
     return True

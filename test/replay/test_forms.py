@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.cli.main import main
 
-from .bag_forms import FORMS, foreign_typestore
+from .bag_forms import FORMS, INTERFACES, foreign_typestore, ros1_typestore
 
 SHORT = ["--no-report", "--answers", "1", "-p", "solve_period_s:=1000.0", "--duration", "120"]
 CSV = ("orientations.csv", "edges.csv", "trajectory.tum")
@@ -82,6 +84,52 @@ def test_slam_toolbox_in_both_versions_of_its_edges(tmp_path: Path, version: dic
     np.testing.assert_allclose(corners[:, 1:4], [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], atol=1e-5)
     heading = Rotation.from_quat(corners[:, 4:]).as_euler("ZYX", degrees=True)[:, 0] % 360
     np.testing.assert_allclose(heading, [0, 90, 180, 270], atol=1e-3)
+
+
+ROS1_NAMES = {"from_id": "fromId", "to_id": "toId", "poses_id": "posesId", "map_to_odom": "mapToOdom"}
+OTHER_NAMES = {"from_id": "begin", "to_id": "end"}
+MAP_GRAPH = "rtabmap_msgs/msg/MapGraph"
+
+
+@pytest.mark.parametrize("package", ["rtabmap_msgs", "rtabmap_ros"])
+def test_rtabmap_in_the_words_of_ros1(tmp_path: Path, package: str) -> None:
+    """Its fields have other names there, and its package had another one before 2022."""
+    bag = rtabmaps_square(tmp_path / "old.bag", package, ROS1_NAMES)
+    options = [] if package == "rtabmap_msgs" else ["--edges", f"/rtabmap/mapGraph:{MAP_GRAPH}"]
+    assert main(["replay", str(bag), "--output", str(tmp_path / "out"), "--no-report", *options]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["keyframes"], summary["edges"], summary["loop_closures"]) == (4, 4, 1)
+
+
+def test_a_version_with_other_fields_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = rtabmaps_square(tmp_path / "other.bag", "rtabmap_msgs", OTHER_NAMES)
+    assert main(["replay", str(bag), "--output", str(tmp_path / "out"), "--no-report"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"rotavg: error: {bag}: /rtabmap/mapGraph is {MAP_GRAPH}, in a version with other fields")
+    assert told.count("\n") == 1
+
+
+def rtabmaps_square(path: Path, package: str, names: dict[str, str]) -> Path:
+    """A ROS 1 bag with RTAB-Map's graph of a square that closes, its fields renamed."""
+    store, texts = ros1_typestore(), {}
+    for each in ("Link", "MapGraph"):
+        texts[each] = (INTERFACES / "rtabmap_msgs" / "msg" / f"{each}.msg").read_text(encoding="utf-8")
+        for old, new in names.items():
+            texts[each] = texts[each].replace(old, new)
+        store.register(get_types_from_msg(texts[each], f"{package}/msg/{each}"))
+    types = store.types
+    turn = types["geometry_msgs/msg/Quaternion"](*Rotation.from_euler("z", 90, degrees=True).as_quat())
+    step = types["geometry_msgs/msg/Transform"](types["geometry_msgs/msg/Vector3"](1.0, 0.0, 0.0), turn)
+    ends = [(0, 1, 0), (1, 2, 0), (2, 3, 0), (3, 0, 1)]
+    links = [types[f"{package}/msg/Link"](*each, step, np.eye(6).ravel() * 1e4) for each in ends]
+    header = types["std_msgs/msg/Header"](
+        seq=0, stamp=types["builtin_interfaces/msg/Time"](sec=103, nanosec=0), frame_id="map"
+    )
+    graph = types[f"{package}/msg/MapGraph"](header, step, np.arange(4, dtype=np.int32), [], links)
+    with Rosbag1Writer(path) as writer:
+        connection = writer.add_connection("/rtabmap/mapGraph", f"{package}/msg/MapGraph", typestore=store)
+        writer.write(connection, 10**9, store.serialize_ros1(graph, f"{package}/msg/MapGraph"))
+    return path
 
 
 def numbered_square_in_the_words_of(store):

@@ -108,6 +108,12 @@ def test_who_brings_the_keyframes(plan_for) -> None:
     assert told.parameters.estimator.keyframe_source == "odometry"
 
 
+def test_only_the_edges_that_are_used_bring_keyframes(plan_for) -> None:
+    topics = {"/odom": ODOM, "/edges": STEP, "/loops": CLOSURE}
+    assert plan_for(topics, edges=["/loops"]).parameters.estimator.keyframe_source == "odometry"
+    assert plan_for(topics, edges=["/edges"]).parameters.estimator.keyframe_source == "edges"
+
+
 def test_several_robots(plan_for) -> None:
     topics = {"/red/odom": ODOM, "/blue/odom": ODOM, "/truth": ODOM, "/blue/gt": ODOM}
     plan = plan_for(topics, odometry=["/red/odom", "blue/odom"], references=["/truth", "/blue/gt"])
