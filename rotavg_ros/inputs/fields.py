@@ -76,11 +76,11 @@ def precision_of_covariance(covariance: Sequence[float]) -> float:
 def edge_id_of(source: Key, target: Key, kind: int) -> int:
     """An id for an edge whose sender gives none, the same in every run.
 
-    Within a robot: kind (1 bit), source's id (31 bits), target's id (32 bits). Between robots: kind, and a hash of both
-    ends (63 bits), which tells robots apart.
+    Within a robot: kind (1 bit), source's id (31 bits), target's id (32 bits). Where ids are larger, as gtsam's symbols
+    are, and between robots, which it tells apart: kind, and a hash of both ends (63 bits).
     """
     (source_robot, source_id), (target_robot, target_id) = source, target
-    if source_robot == target_robot:
-        return kind << 63 | (source_id % 2**31) << 32 | target_id % 2**32
+    if source_robot == target_robot and 0 <= source_id < 2**31 and 0 <= target_id < 2**32:
+        return kind << 63 | source_id << 32 | target_id
     digest = hashlib.blake2b(ascii((source, target)).encode(), digest_size=8).digest()
     return kind << 63 | int.from_bytes(digest, "little") >> 1

@@ -36,3 +36,10 @@ def test_names_of_edges_are_the_same_in_every_run() -> None:
     """State files and the labels in them outlive the process."""
     assert edge_id_of(("a", 5), ("b", 7), 1) == 14346040074212964179
     assert edge_id_of(("a", 5), ("b", 7), 0) == 14346040074212964179 - 2**63
+
+
+def test_names_of_edges_tell_symbols_apart() -> None:
+    """gtsam's keys have a letter in their highest byte: a0, b0, x0 …"""
+    keys = [("r", ord(letter) << 56 | number) for letter in "abx" for number in (0, 1)] + [("r", 0), ("r", 1)]
+    names = [edge_id_of(source, target, 1) for source in keys for target in keys]
+    assert len(set(names)) == 64 and all(2**63 <= name < 2**64 for name in names)
