@@ -68,6 +68,7 @@ class _Content:
     truth: list[Pose] = field(default_factory=list)
     note: dict[str, Any] = field(default_factory=dict)
     edge_topics: str = ""
+    stamp_of: dict[int, int] = field(default_factory=dict)  # of keyframes by id: the first that is stated
     repeated: int = 0
     left_out: Counter[str] = field(default_factory=Counter)
     warnings: tuple[str, ...] = ()
@@ -151,7 +152,12 @@ def _read(bag: BagReader) -> _Content:
             content.truth.append(read_odometry(message))
         else:
             frames.take(message)
-    once = {(edge.id, edge.source, edge.target, edge.source_from_target.tobytes()): edge for edge in content.edges}
+    once: dict[Any, Edge] = {}
+    for edge in content.edges:
+        once.setdefault((edge.id, edge.source.key, edge.target.key, edge.source_from_target.tobytes()), edge)
+        for end in (edge.source, edge.target):
+            if end.id is not None and end.stamp_ns:
+                content.stamp_of.setdefault(end.id, end.stamp_ns)
     content.repeated = len(content.edges) - len(once)
     content.edges = list(map(frames.edge_of_body, once.values()))  # the last transform may come after the edges
     content.warnings = frames.warnings
@@ -204,13 +210,9 @@ def _from_ids(content: _Content) -> GraphFile:
             {"self-edges": len(content.edges) - len(proper), _REPEATED: content.repeated, **content.left_out}
         ),
     )
-    stated = [end for edge in edges for end in (edge.source, edge.target) if end.stamp_ns]
-    stamp_of = {end.id: end.stamp_ns for end in stated}
-    stamp_of.update(zip(note.get("lone_ids", []), note.get("lone_stamps_ns", []), strict=False))
-    if not any(stamp_of.values()) and "stamps" not in note:
-        return graph_file
+    stamp_of = content.stamp_of | dict(zip(note.get("lone_ids", []), note.get("lone_stamps_ns", []), strict=False))
     stamps_ns = np.array([stamp_of.get(node_id, 0) for node_id in graph_file.node_ids.tolist()], dtype=np.int64)
-    return replace(graph_file, stamps_ns=stamps_ns)
+    return replace(graph_file, stamps_ns=stamps_ns) if stamps_ns.any() or "stamps" in note else graph_file
 
 
 def _from_stamps(content: _Content) -> GraphFile:

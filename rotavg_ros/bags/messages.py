@@ -29,6 +29,11 @@ class Keyframe:
     stamp_ns: int
     robot: str = ""
 
+    @property
+    def key(self) -> tuple[str, bool, int]:
+        """What identifies the end: equal for equal ends, whether or not their stamps are stated beside their ids."""
+        return (self.robot, self.id is not None, self.stamp_ns if self.id is None else self.id)
+
 
 @dataclass(frozen=True)
 class Edge:

@@ -454,6 +454,19 @@ def test_an_edge_that_is_sent_again_counts_once(tmp_path: Path, by_stamp: bool) 
     assert read.skipped == {"edges that are sent again": 1}
 
 
+@pytest.mark.parametrize("first_has_stamps", [True, False])
+def test_an_edge_that_is_sent_again_with_its_keyframes_stamps_is_the_same(
+    tmp_path: Path, first_has_stamps: bool
+) -> None:
+    """As in a replay: ids say which keyframes are meant. Whichever edge states their stamps, the first one counts."""
+    bare, stamped = ([Keyframe(number, number * has_stamps) for number in (3, 9)] for has_stamps in (0, 1))
+    first, again = (stamped, bare) if first_has_stamps else (bare, stamped)
+    read = read_graph_bag(bag_of_edges(tmp_path / "bag", [edge(5, *first), replace(edge(5, *again), precision=0.25)]))
+    assert (read.graph.num_edges, read.skipped) == (1, {"edges that are sent again": 1})
+    assert read.stamps_ns is not None and read.stamps_ns.tolist() == [3, 9]
+    assert read.graph.precision.tolist() != [0.25]
+
+
 def test_translations_that_are_none_are_not_known(tmp_path: Path) -> None:
     """What is written can be read."""
     far, lost = (
