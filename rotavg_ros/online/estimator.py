@@ -26,7 +26,7 @@ from rotavg_ros.online.measurements import (
     whole_nanoseconds,
 )
 from rotavg_ros.online.options import EstimatorOptions
-from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.online.quaternion import IDENTITY, Quaternion
 from rotavg_ros.online.state import content as state_content
 from rotavg_ros.online.state import file as state_file
 from rotavg_ros.online.state.discarded import Discarded
@@ -79,6 +79,7 @@ class OnlineEstimator:
         stamp_ns: int,
         world_from_body: Sequence[float],
         position: Sequence[float] | None = None,
+        body_from_sensor: Sequence[float] = IDENTITY,
     ) -> RejectReason | None:
         """Take an odometry message.
 
@@ -87,6 +88,8 @@ class OnlineEstimator:
             stamp_ns: nanoseconds, ascending per robot. A stamp far ahead is believed only if the next one agrees.
             world_from_body: xyzw, the body in the odometry's frame.
             position: metres, for the keyframes' distance criterion.
+            body_from_sensor: xyzw, orientation in the body's frame of the sensor at whose zero pose this odometry
+                begins, so that a return to it is recognised; default: the body itself.
 
         Odometry that begins anew begins a new component, placed at first where the robot was last. When its stamps have
         gone back for several messages in a row, the options decide what happens.
@@ -97,8 +100,8 @@ class OnlineEstimator:
         Raises:
             UserError: ``stamp_ns`` is no whole number.
         """
-        turn, place = plain_numbers(world_from_body), plain_numbers(position)
-        message = OdometryMessage(robot, whole_nanoseconds(stamp_ns), turn or (), place)
+        turn, place, sensor = map(plain_numbers, (world_from_body, position, body_from_sensor))
+        message = OdometryMessage(robot, whole_nanoseconds(stamp_ns), turn or (), place, sensor or ())
         with self._lock:
             return self._current.add_odometry(message)
 

@@ -71,12 +71,14 @@ class OdometryMessage:
         stamp_ns: nanoseconds.
         world_from_body: xyzw, the body in the odometry's frame.
         position: metres; None or not finite where unknown.
+        body_from_sensor: xyzw, of the sensor at whose zero pose the odometry begins.
     """
 
     robot: str
     stamp_ns: int
     world_from_body: Sequence[float]
     position: Sequence[float] | None
+    body_from_sensor: Sequence[float] = quaternion.IDENTITY
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,7 +73,8 @@ class Feed:
         except RejectedInputError as rejection:
             self._estimator.reject(rejection.reason)
             return
-        if self._estimator.add_odometry(robot, record.stamp_ns, record.world_from_body, record.position) is None:
+        measured = record.stamp_ns, record.world_from_body, record.position
+        if self._estimator.add_odometry(robot, *measured, sensor) is None:
             self._on_odometry(robot, record)
 
     def _take_edges(self, convert: EdgeConverter, topic: str, message: Any) -> None:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION, typestore
 from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message
 from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.bags.writer import BagWriter
 from rotavg_ros.cli.main import main
 
 TF = "tf2_msgs/msg/TFMessage"
@@ -170,3 +171,18 @@ def test_cameras_that_two_robots_carry_differently_are_warned_of_once(
     told = "/between: red/camera is mounted differently on red and on blue"
     assert sum(told in warning for warning in summary["warnings"]) == (not alike)
     assert capsys.readouterr().err.count(told) == (not alike)
+
+
+def test_a_cameras_odometry_begins_anew_at_the_cameras_zero(tmp_path: Path) -> None:
+    """It is started again after a silence, in which the robot might as well have driven back."""
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/odom", ODOMETRY)
+        for first in (0, 70):
+            for index in range(40):
+                turned = CAMERA.inv() * Rotation.from_euler("z", 3 * index, degrees=True) * CAMERA
+                here, moment = CAMERA.inv().apply([0.2 * index, 0.0, 0.0]), stamp(0) + (first + index) * 10**8
+                bag.write("/odom", moment, odometry_message(moment, here, turned.as_quat(), "odom"))
+    mounted = ["-p", f"odometry_sensor_orientations:={CAMERA.as_quat().tolist()}", "--no-report"]
+    assert main(["replay", str(tmp_path / "bag"), "--output", str(tmp_path / "answer"), *mounted]) == 0
+    summary = json.loads((tmp_path / "answer" / "summary.json").read_text())
+    assert (summary["components"], summary["rejected"]) == (2, {"odometry_jump": 1})

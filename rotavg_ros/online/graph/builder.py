@@ -73,7 +73,7 @@ class GraphBuilder:
         elif track.comes_after_the_clock(message.stamp_ns, self.options.time_jump_ns):
             self.begin_time_line(robot)
         try:
-            track.add(message.stamp_ns, message.world_from_body, message.position)
+            track.add(message.stamp_ns, message.world_from_body, message.position, message.body_from_sensor)
         except RejectedInputError as rejection:
             is_late = rejection.reason is RejectReason.OUT_OF_ORDER_ODOMETRY
             return growth.refuse(rejection.reason), self._late(message, track) if is_late else []

@@ -27,11 +27,19 @@ _SHARES_OF_SPEED = (0.0, 0.5, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class OdometrySample:
-    """One odometry message: the body's pose in the odometry's frame at a stamp."""
+    """One odometry message: the body's pose in the odometry's frame at a stamp.
+
+    Attributes:
+        stamp_ns: nanoseconds.
+        world_from_body: xyzw.
+        position: metres; None where unknown.
+        beginning: world_from_body where such odometry begins; not the identity if it begins at a sensor's zero.
+    """
 
     stamp_ns: int
     world_from_body: Quaternion
     position: Vector | None
+    beginning: Quaternion = quaternion.IDENTITY
 
 
 @dataclass(frozen=True)
@@ -169,7 +177,7 @@ def stands_still(sample: OdometrySample, last: OdometrySample) -> bool:
 
 
 def _beginning(sample: OdometrySample) -> OdometrySample:
-    return OdometrySample(sample.stamp_ns, quaternion.IDENTITY, (0.0, 0.0, 0.0))
+    return OdometrySample(sample.stamp_ns, sample.beginning, (0.0, 0.0, 0.0))
 
 
 def angle_and_metres(first: OdometrySample, second: OdometrySample) -> tuple[float, float]:
@@ -188,7 +196,7 @@ def _distance(first: OdometrySample, second: OdometrySample) -> float:
 
 def _is_zero(sample: OdometrySample) -> bool:
     near = sample.position is None or math.hypot(*sample.position) < _ZERO_DISTANCE_M
-    return near and quaternion.angle(sample.world_from_body) < _ZERO_ANGLE
+    return near and quaternion.angle_between(sample.world_from_body, sample.beginning) < _ZERO_ANGLE
 
 
 def _going_on(last: OdometrySample, before: OdometrySample, stamp_ns: int, share: float) -> OdometrySample:

@@ -76,7 +76,12 @@ class BackwardJumps:
         """Everything in a form that JSON can represent, for :meth:`from_header`."""
         runs = {
             robot: [
-                [message.stamp_ns, list(map(float, message.world_from_body)), message.position and [*message.position]]
+                [
+                    message.stamp_ns,
+                    list(map(float, message.world_from_body)),
+                    message.position and [*message.position],
+                    list(map(float, message.body_from_sensor)),
+                ]
                 for message in run
             ]
             for robot, run in self._runs.items()

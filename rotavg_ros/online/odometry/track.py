@@ -90,20 +90,27 @@ class OdometryTrack:
         """Whether the next message begins a new time line."""
         return self._begins_time_line
 
-    def add(self, stamp_ns: int, world_from_body: Sequence[float], position: Sequence[float] | None) -> OdometrySample:
+    def add(
+        self,
+        stamp_ns: int,
+        world_from_body: Sequence[float],
+        position: Sequence[float] | None,
+        body_from_sensor: Sequence[float] = quaternion.IDENTITY,
+    ) -> OdometrySample:
         """Append a message.
 
         Args:
             stamp_ns: its stamp.
             world_from_body: xyzw.
             position: metres, or None; one that is not finite counts as None.
+            body_from_sensor: xyzw, of the sensor at whose zero pose the odometry begins.
 
         Raises:
             RejectedInputError: the stamp is not after the last one, the rotation or position is invalid, or the message
                 does not continue the last one and no other confirms it yet.
         """
         stamp_ns = checked_stamp(stamp_ns)
-        rotation = checked_rotation(world_from_body)
+        rotation, beginning = checked_rotation(world_from_body), quaternion.inverse(checked_rotation(body_from_sensor))
         check_length(position, 3)
         if self.latest is not None and stamp_ns <= self.latest.stamp_ns and not self._begins_time_line:
             repeated = stamp_ns == self.latest.stamp_ns
@@ -113,7 +120,7 @@ class OdometryTrack:
             x, y, z = position
             has_lost_position = not math.isfinite(x + y + z)
             position = None if has_lost_position else (x, y, z)
-        sample = OdometrySample(stamp_ns, rotation, position)
+        sample = OdometrySample(stamp_ns, rotation, position, beginning)
         if self._begins_time_line:
             self._continuity.forget()
             self.time_line += 1

@@ -98,6 +98,31 @@ def test_a_saved_state_knows_where_the_new_chain_begins(estimator, solver, tmp_p
     np.testing.assert_allclose(restored.tick().world_from_body, estimator.tick().world_from_body, atol=1e-12)
 
 
+@pytest.mark.parametrize("mounting", [[0, 0, 0], [90, 0, 0], [-90, 0, -90]])
+@pytest.mark.parametrize("is_restored", [False, True])
+def test_odometry_of_a_mounted_sensor_begins_anew_where_the_sensor_is_at_zero(solver, mounting, is_restored, tmp_path):
+    """A camera's odometry begins at the camera's zero, which is no zero of the body's orientation."""
+    body_from_sensor = Rotation.from_euler("zyx", mounting, degrees=True)
+
+    def drive(estimator: OnlineEstimator, first: int) -> None:
+        for index in range(40):
+            turned = Rotation.from_euler("z", 3 * index, degrees=True)  # of the body since the start
+            place = body_from_sensor.inv().apply([0.2 * index, 0.0, 0.0])
+            world_from_body = body_from_sensor.inv() * turned
+            estimator.add_odometry(
+                "r", stamp(first + index), world_from_body.as_quat(), place, body_from_sensor.as_quat()
+            )
+
+    estimator = OnlineEstimator(OPTIONS, solver)
+    drive(estimator, 0)
+    if is_restored:
+        estimator.save(tmp_path / "state.npz")
+        estimator = OnlineEstimator(OPTIONS, solver)
+        estimator.load(tmp_path / "state.npz")
+    drive(estimator, 70)
+    assert estimator.counts().odometry_restarts == 1
+
+
 def test_edges_stamped_years_ahead_let_nothing_waiting_go(solver):
     options = EstimatorOptions(keyframe_source="edges")
     estimator = OnlineEstimator(options, solver)

@@ -156,7 +156,8 @@ class Subscriptions:
         else:
             topic.note_frames(record.frame_id, record.child_frame_id)
             self._intake.frames.note_body(topic.robot, record.child_frame_id, body_from_sensor)
-            reason = self._estimator.add_odometry(topic.robot, record.stamp_ns, record.world_from_body, record.position)
+            measured = record.stamp_ns, record.world_from_body, record.position
+            reason = self._estimator.add_odometry(topic.robot, *measured, body_from_sensor)
         if reason is None:
             self._health.took_odometry(topic.name)
             self._outputs.publish_odometry(topic.robot, topic.name, message, record)
