@@ -16,6 +16,8 @@ from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_mess
 from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.bags.writer import BagWriter
 from rotavg_ros.cli.main import main
+from rotavg_ros.settings.parameters import NodeParameters
+from rotavg_ros.settings.text import to_yaml
 
 TF = "tf2_msgs/msg/TFMessage"
 CAMERA = Rotation.from_euler("zx", [90, 90], degrees=True)
@@ -111,6 +113,15 @@ def test_the_bags_own_transforms(tmp_path: Path, nameless: int) -> None:
     degrees, metres = residuals(tmp_path / "out")
     assert (degrees < 1e-3).all() and (metres < 1e-3).all()
     assert summary["outliers"] == 0 and summary["warnings"] == []
+    assert summary["topics"]["/tf_static"] == "frames of sensors"
+
+
+def test_a_file_of_all_defaults_leaves_the_transforms_in_use(tmp_path: Path) -> None:
+    """As `rotavg_node --print-parameters` writes it; an orientation that is stated would rule them out."""
+    write_bag(tmp_path / "bag", with_tf=True)
+    (tmp_path / "node.yaml").write_text(to_yaml(NodeParameters()))
+    summary = replayed(tmp_path / "bag", tmp_path / "out", "--params", str(tmp_path / "node.yaml"))
+    assert (residuals(tmp_path / "out")[0] < 1e-3).all()
     assert summary["topics"]["/tf_static"] == "frames of sensors"
 
 
