@@ -19,6 +19,7 @@ from rotavg_ros.inputs.registry import (
     FRAMELESS_ODOMETRY,
     NAMES_ITS_BODY,
     ODOMETRY_CONVERTERS,
+    OF_ONE_ROBOT,
 )
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "FRAMELESS_ODOMETRY",
     "NAMES_ITS_BODY",
     "ODOMETRY_CONVERTERS",
+    "OF_ONE_ROBOT",
     "EdgeConverter",
     "EdgeRecord",
     "EdgeVerdict",

@@ -36,6 +36,12 @@ EDGE_CONVERTERS: dict[str, Callable[[Source], EdgeConverter]] = {
 # Types with edges between keyframes that the sender has chosen and numbered, so that none may be made from odometry.
 BRINGS_KEYFRAMES = frozenset(_FOREIGN)
 
+# Of these, types with keyframes of a robot that no message names.
+OF_ONE_ROBOT = BRINGS_KEYFRAMES - {
+    "pose_graph_tools_msgs/msg/PoseGraph",
+    "cslam_common_interfaces/msg/InterRobotLoopClosure",
+}
+
 # Its frame_id is the frame attached to the body; it does not name the frame in which the body turns.
 FRAMELESS_ODOMETRY = "sensor_msgs/msg/Imu"
 

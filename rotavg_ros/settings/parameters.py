@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from rotavg_ros.inputs import BRINGS_KEYFRAMES, FRAMELESS_ODOMETRY, Source
+from rotavg_ros.inputs import BRINGS_KEYFRAMES, FRAMELESS_ODOMETRY, OF_ONE_ROBOT, Source
 from rotavg_ros.online import EstimatorOptions, quaternion
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.option import Option, OptionError, check_options, option, options_of, path_of
@@ -119,6 +119,7 @@ class NodeParameters:
     def __post_init__(self) -> None:
         check_options(self)
         self._check_topics()
+        self._check_edge_robots()
         if self.autosave_period_s > 0 and not self.state_file:
             raise OptionError("autosave_period_s is set but state_file is empty; name a file")
         self._check_forwards()
@@ -141,11 +142,6 @@ class NodeParameters:
             other = robot_of.setdefault(prefix, robot)
             if other != robot:
                 raise OptionError(f"robots names {other!r} and {robot!r}, whose topics would both begin with {prefix}")
-        if len(self.edge_robots) not in (1, len(self.edge_topics)):
-            raise OptionError(
-                f"edge_robots has {len(self.edge_robots)} entries; give 1, or one per edge topic "
-                f"({len(self.edge_topics)})"
-            )
         _check_orientations("odometry", self.odometry_sensor_orientations, len(self.odometry_topics))
         _check_orientations("edge", self.edge_sensor_orientations, len(self.edge_topics))
         for entry in self.edge_topics:
@@ -154,6 +150,24 @@ class NodeParameters:
                 raise OptionError(f"edge_topics: {entry!r} lacks a topic or a type; write topic or topic:type")
             if message_type in BRINGS_KEYFRAMES and self.estimator.keyframe_source != "edges":
                 raise OptionError(f"edge topic {entry!r} brings keyframes of its own; set keyframe_source to edges")
+
+    def _check_edge_robots(self) -> None:
+        if len(self.edge_robots) not in (1, len(self.edge_topics)):
+            raise OptionError(
+                f"edge_robots has {len(self.edge_robots)} entries; give 1, or one per edge topic "
+                f"({len(self.edge_topics)})"
+            )
+        sent: dict[tuple[str, str], str] = {}
+        for entry, source in zip(self.edge_topics, self.edge_sources(), strict=True):
+            topic, _, message_type = entry.partition(":")
+            if message_type not in OF_ONE_ROBOT:
+                continue
+            other = sent.setdefault((source.robot, message_type), topic)
+            if other != topic:
+                raise OptionError(
+                    f"edge topics {other} and {topic} both number keyframes of {source.robot!r}; name the robot of "
+                    "each edge topic in edge_robots"
+                )
 
     def _check_forwards(self) -> None:
         known = [entry.partition(":")[0] for entry in self.edge_topics]

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from rotavg_ros import EstimatorOptions, UserError
-from rotavg_ros.option import options_of
+from rotavg_ros.option import OptionError, options_of
 from rotavg_ros.settings.parameters import PARAMETERS, NodeParameters
 from rotavg_ros.settings.text import to_markdown, to_yaml
 
@@ -104,3 +104,24 @@ def test_a_change_keeps_the_rest_and_ignores_other_nodes_parameters() -> None:
 def test_parameters_that_cannot_be(changes: dict[str, object], message: str) -> None:
     with pytest.raises(UserError, match=f"^{re.escape(message)}"):
         NodeParameters().changed(changes)
+
+
+@pytest.mark.parametrize("kind", ["rtabmap_msgs/msg/MapGraph", "cslam_common_interfaces/msg/KeyframeOdom"])
+def test_keyframes_of_two_robots_are_not_taken_for_one_robots(kind: str) -> None:
+    """Both count from 0, and their messages name no robot."""
+    values = {"edge_topics": [f"/a/graph:{kind}", f"/b/graph:{kind}"], "keyframe_source": "edges"}
+    with pytest.raises(OptionError) as caught:
+        NodeParameters().changed(values)
+    told = "edge topics /a/graph and /b/graph both number keyframes of 'robot'; name the robot of each edge topic in "
+    assert str(caught.value) == told + "edge_robots"
+    fleet = {"robots": ["a", "b"], "odometry_topics": ["/a/odom", "/b/odom"]}
+    named = NodeParameters().changed(values | fleet | {"edge_robots": ["", "b"]})
+    assert [source.robot for source in named.edge_sources()] == ["a", "b"]
+
+
+def test_several_topics_may_tell_of_a_robot() -> None:
+    """Closures beside keyframes, and graphs that number their robots."""
+    kinds = ["slam_toolbox/msg/NewNodeEvent", "slam_toolbox/msg/PoseGraph"]
+    kinds += ["pose_graph_tools_msgs/msg/PoseGraph"] * 2 + ["cslam_common_interfaces/msg/InterRobotLoopClosure"] * 2
+    topics = [f"/topic_{number}:{kind}" for number, kind in enumerate(kinds)]
+    assert NodeParameters().changed({"edge_topics": topics, "keyframe_source": "edges"}).edge_topics == tuple(topics)
