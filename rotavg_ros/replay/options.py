@@ -54,6 +54,8 @@ def _content(text: str) -> Any:
 def read_parameter_file(path: Path) -> tuple[Values, list[str]]:
     """The node's parameters in a file for ``--params-file``; those that only rclpy uses are ignored.
 
+    Where the node has a namespace, its topics are in it: those that the file names, and by default the node's own.
+
     Returns:
         the values by name; and a line for each parameter that the node does not have, which it ignores as well.
 
@@ -89,7 +91,19 @@ def read_parameter_file(path: Path) -> tuple[Values, list[str]]:
             values[name] = _checked(name, value, str(path))
         elif not name.startswith(_RCLPYS):
             notes.append(f"{path}: unknown parameter {name} is ignored" + _meant(name, "; did you mean {}?"))
-    return values, notes
+    namespace = next(iter(named), "").rpartition("/")[0]
+    return values | (_in_namespace(namespace, values) if namespace.strip("/*") else {}), notes
+
+
+def _in_namespace(namespace: str, values: Values) -> Values:
+    """The parameters that name topics to listen to, with absolute names, as the node resolves them."""
+    return {
+        name: tuple(
+            entry if entry.startswith("/") else f"{namespace}/{entry}"
+            for entry in values.get(name, PARAMETERS[name].default)
+        )
+        for name in ("odometry_topics", "edge_topics")
+    }
 
 
 def _nodes(content: Any, name: str = "") -> Iterator[tuple[str, Mapping[Any, Any]]]:

@@ -276,7 +276,37 @@ ANGLE = {"keyframe_angle_deg": 7.0}
 def test_what_the_node_takes_is_taken(tmp_path: Path, content: dict, notes: list[str]) -> None:
     path = tmp_path / "node.yaml"
     path.write_text(yaml.safe_dump(content, sort_keys=False))
-    assert read_parameter_file(path) == (ANGLE, [f"{path}: {note}" for note in notes])
+    values, said = read_parameter_file(path)
+    assert {name: values[name] for name in values if name not in ("odometry_topics", "edge_topics")} == ANGLE
+    assert said == [f"{path}: {note}" for note in notes]
+
+
+@pytest.mark.parametrize(
+    ("name", "stated", "odometry"),
+    [
+        ("/blue/rotavg", {}, "/blue/odom"),
+        ("/blue/rotavg", {"odometry_topics": ["wheels"]}, "/blue/wheels"),
+        ("/blue/rotavg", {"odometry_topics": ["/red/odom"]}, "/red/odom"),
+        ("/fleet/red/rotavg", {}, "/blue/odom"),  # the bag has nothing of it, so it is guessed
+        ("/**/rotavg", {}, "/blue/odom"),
+        ("/rotavg", {"odometry_topics": ["blue/odom"]}, "/blue/odom"),
+    ],
+)
+def test_topics_are_those_of_the_nodes_namespace(
+    plan_for, tmp_path: Path, name: str, stated: dict[str, list[str]], odometry: str
+) -> None:
+    (tmp_path / "node.yaml").write_text(yaml.safe_dump({name: {"ros__parameters": ANGLE | stated}}))
+    values, _ = read_parameter_file(tmp_path / "node.yaml")
+    topics = {"/red/odom": ODOM, "/blue/odom": ODOM, "/blue/wheels": ODOM}
+    topics |= {"/red/relative_rotations": CLOSURE, "/blue/relative_rotations": CLOSURE}
+    plan = plan_for(topics, values=values)
+    assert [source.topic for source in plan.odometry] == [odometry]
+    own = (
+        ["/blue/relative_rotations"]
+        if name == "/blue/rotavg"
+        else ["/blue/relative_rotations", "/red/relative_rotations"]
+    )
+    assert [source.topic for source in plan.edges] == own
 
 
 @pytest.mark.parametrize(
