@@ -6,6 +6,7 @@ from types import SimpleNamespace as Fields
 
 from rotavg_ros.online import EstimatorOptions, OnlineEstimator
 from rotavg_ros.replay.feed import Feed
+from rotavg_ros.replay.plan import Input, Plan
 from rotavg_ros.settings.parameters import NodeParameters
 
 MAP_GRAPH = "rtabmap_msgs/msg/MapGraph"
@@ -24,7 +25,7 @@ def graph(*links: Fields) -> Fields:
 def test_a_closure_that_had_to_go_comes_in_with_a_later_graph() -> None:
     online = OnlineEstimator(EstimatorOptions(keyframe_source="edges", pending_capacity=1), lambda *_, **__: None)
     parameters = NodeParameters().changed({"edge_topics": (f"graph:{MAP_GRAPH}",), "keyframe_source": "edges"})
-    plan = Fields(parameters=parameters, odometry=(), edges=[Fields(topic="graph", type_name=MAP_GRAPH)])
+    plan = Plan(parameters, (), (Input("graph", MAP_GRAPH),), {}, ())
     feed = Feed(online, plan, Fields(edge_of_body=lambda edge, *_: edge), lambda *_: None)
     closures = link(0, 4, 1), link(1, 5, 1)
     feed("graph", graph(*(link(step, step + 1, 0) for step in range(3)), *closures))
