@@ -100,6 +100,16 @@ def polish(
     return replace(state, others=evaluation.others), evaluation
 
 
+def polish_fully(problem: Problem, state: State) -> tuple[State, Evaluation]:
+    """The same for a state that may be far from its optimum, as where many labels changed at once."""
+    state, evaluation = polish(problem, state)
+    while True:
+        before = evaluation.total
+        state, evaluation = polish(problem, state)
+        if evaluation.total > before - problem.limits.slack:
+            return state, evaluation
+
+
 def _extrapolated(before: Noise, after: Noise, last: np.ndarray) -> tuple[Noise, np.ndarray]:
     """The extrapolated limit of a sequence of noises (Aitken 1926), and the latest change.
 

@@ -71,7 +71,11 @@ class Mode:
     def is_turned_like(self, other: State) -> bool:
         """Whether orientations agree to within a closure's error."""
         cosine = np.abs((self.state.correction * other.correction).sum(axis=0)).min()
-        return bool(2 * np.arccos(min(float(cosine), 1.0)) < _SAME * np.sqrt(self.state.noise.closure_variance))
+        return not self.is_turned_by(2 * np.arccos(min(float(cosine), 1.0)))
+
+    def is_turned_by(self, angle: float) -> bool:
+        """Whether a part that turns by ``angle``, rad, makes another answer: by more than a closure's error."""
+        return bool(angle >= _SAME * np.sqrt(self.state.noise.closure_variance))
 
     @cached_property
     def is_false(self) -> np.ndarray:
@@ -87,9 +91,14 @@ class Mode:
     def _covariance(self) -> np.ndarray:
         return self.evaluation.factorised.covariance(self.problem.closure)
 
+    @property
+    def covariance_is_cheap(self) -> bool:
+        """Whether the closures are few enough for the covariance of all of them at once."""
+        return len(self.problem.closure) <= _MAX_DENSE
+
     def covariance_of(self, members: np.ndarray) -> np.ndarray:
         """``(n, n)`` rad², covariance of the fitted values of some closures."""
-        if len(self.problem.closure) <= _MAX_DENSE:
+        if self.covariance_is_cheap:
             return np.asarray(self._covariance[np.ix_(members, members)])
         return self.evaluation.factorised.covariance(self.problem.closure[members])
 

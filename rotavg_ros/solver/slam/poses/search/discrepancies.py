@@ -24,3 +24,9 @@ def own_variances(pose: PoseMode, members: np.ndarray) -> np.ndarray:
     shared = np.where(problem.run[problem.mode.problem.closure] >= 0, pose.state.noise.common, 0.0)
     own[:, k:] = (stated_variance(problem, pose.state) - shared)[members, None]
     return own
+
+
+def log_normal(off: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """``(n,)`` nats, log densities of ``(n, d)`` with covariances ``(n, d, d)``, up to a constant."""
+    square = (off * np.linalg.solve(covariance, off[:, :, None])[:, :, 0]).sum(axis=1)
+    return np.asarray(-(square + np.linalg.slogdet(covariance)[1]) / 2)

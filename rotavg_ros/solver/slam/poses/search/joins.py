@@ -22,7 +22,7 @@ from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.search.motions import Motions
 from rotavg_ros.solver.slam.poses.search.settling import LEAST_GAIN, NEAR, Rival, moved, settling
 from rotavg_ros.solver.slam.poses.solved import PoseMode
-from rotavg_ros.solver.slam.posterior.em import polish
+from rotavg_ros.solver.slam.posterior.em import polish_fully
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.moves.turning import sides_turned, trusted_after_turn
 
@@ -90,7 +90,7 @@ def _turned(mode: Mode, join: Join) -> Mode:
     state = sides_turned(mode, join.moving, join.resting, join.turn)
     trusted = trusted_after_turn(mode, state)
     trusted[problem.closure[join.doubted]], trusted[problem.closure[join.believed]] = 0.0, 1.0
-    return Mode(problem, *polish(problem, replace(state, trusted=trusted)), mode.origin)
+    return Mode(problem, *polish_fully(problem, replace(state, trusted=trusted)), mode.origin)
 
 
 def other_joins(pose: PoseMode) -> list[Join]:

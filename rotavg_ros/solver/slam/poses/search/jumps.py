@@ -16,9 +16,10 @@ import numpy as np
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.search.discrepancies import log_normal
 from rotavg_ros.solver.slam.poses.search.jump_witnesses import AS_FAR, Jump, Place, Proposal, Witnesses
 from rotavg_ros.solver.slam.poses.solved import PoseMode
-from rotavg_ros.solver.slam.posterior.em import polish
+from rotavg_ros.solver.slam.posterior.em import polish_fully
 from rotavg_ros.solver.slam.posterior.labels.prior import log_slip_prior
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.wording import between_nodes
@@ -100,18 +101,12 @@ def _by_all_else(pose: PoseMode, price: float) -> Jump | None:
     free = np.zeros((len(could), off.shape[1], problem.shifts))
     free[:, problem.turns :] = inverse_root(solved.covariance[could][:, ::-1, ::-1])[:, ::-1, ::-1]
     jumped = total + problem.could_jump[could, None, None] * free @ free.transpose(0, 2, 1)
-    gained = _log_normal(off, jumped) - _log_normal(off, total) - price
+    gained = log_normal(off, jumped) - log_normal(off, total) - price
     best = int(np.argmax(gained))
     if gained[best] < 0:  # no labels change, so there is nothing that the prediction leaves out
         return None
     nowhere, none = np.zeros(problem.drawn.num_nodes, dtype=bool), np.zeros(len(problem.closures), dtype=bool)
     return Jump(int(could[best]), -1, nowhere, np.zeros(3), float(gained[best]), none)
-
-
-def _log_normal(off: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """``(n,)`` nats, log densities of ``(n, d)`` with covariances ``(n, d, d)``, up to a constant."""
-    square = (off * np.linalg.solve(covariance, off[:, :, None])[:, :, 0]).sum(axis=1)
-    return np.asarray(-(square + np.linalg.slogdet(covariance)[1]) / 2)
 
 
 def _price(problem: PoseProblem) -> float:
@@ -145,7 +140,7 @@ def _trusting(pose: PoseMode, closures: np.ndarray) -> Mode:
     trusted = before.state.trusted.copy()
     trusted[edges] = 1.0
     state = replace(before.state, correction=pose.state.correction, trusted=trusted)
-    return Mode(before.problem, *polish(before.problem, state), before.origin)
+    return Mode(before.problem, *polish_fully(before.problem, state), before.origin)
 
 
 def without_odd_jumps(pose: PoseMode) -> PoseProblem | None:

@@ -15,6 +15,7 @@ from rotavg_ros.solver.slam.poses.row_errors import initial_noise
 from rotavg_ros.solver.slam.poses.search.beginnings import begun_at_runs
 from rotavg_ros.solver.slam.poses.search.joins import joined_otherwise
 from rotavg_ros.solver.slam.poses.search.jumps import jumps_too_far, likeliest_jump, with_jump, without_odd_jumps
+from rotavg_ros.solver.slam.poses.search.mending import without_slips
 from rotavg_ros.solver.slam.poses.search.runs import with_runs, without_runs
 from rotavg_ros.solver.slam.poses.search.settling import HOPELESS, NEAR, SLACK, Rival, settled, settling
 from rotavg_ros.solver.slam.poses.solved import PoseMode
@@ -73,6 +74,7 @@ def rival_poses(
     if (other := _begun_otherwise(likeliest)) is not None:
         ended.append(settling(other, least))
     ended.extend(_with_other_runs(_distinct(ended, HOPELESS)[:_MAX_ASKED]))
+    ended.append(without_slips(min(ended, key=lambda rival: rival.cost)))
     ended.append(begun_at_runs(min(ended, key=lambda rival: rival.cost)))
     ended.extend(_jumping(min(ended, key=lambda rival: rival.cost)))
     rivals = _distinct(ended, NEAR)[:_MAX_RIVALS]

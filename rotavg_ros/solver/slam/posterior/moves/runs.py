@@ -27,25 +27,29 @@ _LEAST_MEMBERS = 2
 
 
 def propose_rejected_runs(mode: Mode) -> Iterator[Proposal]:
-    """Proposes to reject the runs of good closures whose residuals have the largest common part."""
+    """Proposes to reject the runs of good closures that all other edges support least."""
     problem, limits = mode.problem, mode.problem.limits
-    runs = _runs(mode)[: limits.candidates]
+    runs = _runs(mode)
     if not runs:
         return
     residual = mode.evaluation.residual[problem.closure]
     before = log_labelled(mode, mode.is_false, residual)
-    for members in runs:
-        if (found := _without(mode, members)) is None:
-            continue
-        log_density, off = found
+    for members, log_density, off in runs:
         is_false, discrepancy = mode.is_false.copy(), residual.copy()
         is_false[members], discrepancy[members] = True, off
         predicted = before + log_density - log_labelled(mode, is_false, discrepancy)
-        yield Proposal("reject a run", predicted, partial(_rejected, mode, members), limits.slack)
+        # A run that alone holds a part turns it, and the map without it may be a rival though it is less likely.
+        turned = float(np.linalg.norm((off * problem.sign[members, None]).mean(axis=0)))
+        slack = limits.rival if mode.is_turned_by(turned) else limits.slack
+        yield Proposal("reject a run", predicted, partial(_rejected, mode, members), slack)
 
 
-def _runs(mode: Mode) -> list[np.ndarray]:
-    """Good closures ``(K,)`` of each run, the run whose summed residual is the most standard deviations first."""
+def _runs(mode: Mode) -> list[tuple[np.ndarray, float, np.ndarray]]:
+    """Good closures ``(K,)`` of runs, with what all other edges say of them (:func:`_without`).
+
+    The least supported runs first: their density is lowest, in units of what their closures themselves allow. Where
+    there are too many closures for that, of the runs whose summed residual is the most standard deviations.
+    """
     problem, is_good = mode.problem, ~mode.is_false & ~np.isinf(mode.problem.log_odds[mode.problem.closure])
     own = variances(problem, mode.state.noise)[problem.closure]
     off = mode.evaluation.residual[problem.closure] * (problem.sign * is_good)[:, None]
@@ -53,7 +57,15 @@ def _runs(mode: Mode) -> list[np.ndarray]:
     square = (total**2).sum(axis=1) / np.maximum(np.bincount(problem.run, own * is_good), np.finfo(np.float64).tiny)
     order = np.argsort(-square, kind="stable")
     chosen = order[np.bincount(problem.run, is_good)[order] >= _LEAST_MEMBERS]
-    return [np.flatnonzero(is_good & (problem.run == run)) for run in chosen[: problem.limits.candidates]]
+    if not mode.covariance_is_cheap:
+        chosen = chosen[: problem.limits.candidates]
+    found: list[tuple[float, tuple[np.ndarray, float, np.ndarray]]] = []
+    for run in chosen:
+        members = np.flatnonzero(is_good & (problem.run == run))
+        if (told := _without(mode, members)) is not None:
+            support = told[0] + problem.components / 2 * float(np.log(own[members]).sum())
+            found.append((support, (members, *told)))
+    return [run for _, run in sorted(found, key=lambda each: each[0])[: problem.limits.candidates]]
 
 
 def _without(mode: Mode, members: np.ndarray) -> tuple[float, np.ndarray] | None:

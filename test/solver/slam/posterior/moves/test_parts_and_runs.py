@@ -102,6 +102,32 @@ def test_a_run_that_holds_itself_good_is_rejected_as_one(off_deg: float, closure
     assert found.cost - held.cost < best.predicted + 5
 
 
+def test_a_run_that_alone_holds_a_loop_is_rejected_in_a_rival() -> None:
+    """A run off by 25° where odometry knows no better: all else bends until it fits, and it leaves no residual."""
+    length, places = 600, np.arange(0, 580, 6)
+    truth = random_truth(length, 0, planar=True)
+    run = np.stack((60 + np.arange(6), 520 + np.arange(6)))
+    # Many runs of good closures, over short stretches: what they leave is more than what the false run leaves.
+    near = np.concatenate([np.stack((places[k : k + 4], places[k : k + 4] + 15)) for k in range(0, 92, 6)], axis=1)
+    source = np.concatenate((np.arange(length - 1), near[0], run[0]))
+    target = np.concatenate((np.arange(1, length), near[1], run[1]))
+    deviation = np.repeat([1.0, 1.0, 0.2], [length - 1, near.shape[1], run.shape[1]])
+    vector = small_noise(len(source), deviation, 0, planar=True).as_rotvec()
+    vector[-run.shape[1] :, 2] += np.radians(25.0)
+    kind = np.repeat([EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE], [length - 1, near.shape[1] + run.shape[1]])
+    drawn = Drawn.of(measured(truth, source, target, Rotation.from_rotvec(vector), kind=kind), None)
+    problem = drawn.problem
+    begun = mode_at(drawn, truth, [])
+    held = Search(problem).polished(replace(begun.state, trusted=np.ones_like(begun.state.trusted)), "held")
+    edge = problem.graph.view_graph_edge[problem.closure - problem.graph.num_segments]
+    false_ones = problem.closure[edge >= len(source) - run.shape[1]]
+    (proposal,) = (each for each in propose_rejected_runs(held) if (each.make().trusted[false_ones] == 0).all())
+    assert proposal.predicted < proposal.slack == problem.limits.rival
+    found = Search(problem).polished(proposal.make(), proposal.name)
+    assert abs(found.cost - held.cost) < problem.limits.rival
+    assert not held.is_turned_like(found.state)
+
+
 def test_a_rival_is_told_of_though_it_is_the_likeliest() -> None:
     """What is published is the median, here the second."""
     graph, truth = laps({FIRST: 45.0})
