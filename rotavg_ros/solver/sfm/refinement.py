@@ -39,7 +39,7 @@ from rotavg_ros.solver.sfm.noise_density import NoiseDensity
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.step.measure import Measure, l1_weight, l_half_weight
-from rotavg_ros.solver.sfm.step.problem import Problem
+from rotavg_ros.solver.sfm.step.problem import Dispersion, Problem, Step
 from rotavg_ros.solver.sfm.step.structure import Structure
 from rotavg_ros.solver.sfm.symmetric_rows import distinct_entries, turned
 from rotavg_ros.view_graph import ViewGraph
@@ -177,8 +177,9 @@ def shaped_steps(problem: Problem, orientations: Tensor, weights: EdgeWeights, m
     priors, prior = problem.priors, weights.shaped
     noise = problem.round
     variance = problem.variance_of_means()
-    dispersion = torch.ones_like(problem.roots, dtype=orientations.dtype)
-    step, steps = None, torch.zeros_like(problem.roots)
+    dispersion = Dispersion(*torch.ones(2, len(problem.roots), dtype=orientations.dtype, device=orientations.device))
+    step: Step | None = None
+    steps = torch.zeros_like(problem.roots)
     max_steps = steps + max_steps
     is_open = max_steps > 0
     is_held, is_single = ~is_open, problem.everywhere(False)
@@ -195,14 +196,17 @@ def shaped_steps(problem: Problem, orientations: Tensor, weights: EdgeWeights, m
             noise = problem.shapes.estimate(sample, orientations, noise, is_held)
             measure = Measure(noise, variance, l_half_weight, is_single, unit=unit)
             pooled = problem.pooled(orientations, measure, prior)
-            dispersion = torch.where(is_held, dispersion, problem.dispersion(sample, measure, pooled))
+            total = None if step is None else step.weight
+            dispersion = problem.dispersion(sample, measure, pooled, total).but(is_held, dispersion)
             if step is not None and len(is_held) > 1 and bool(is_held.any()):
                 of_edge = is_held[problem.component].index_select(0, problem.graph.source)
                 measure = measure._replace(source_share=step.source_share, is_held=of_edge)
         step = problem.step(orientations, measure, problem.pooled(orientations, measure, prior), is_open)
-        found = (dispersion[problem.component] / step.weight).clamp(min=priors.least_square / 2)
+        # Known once weights have settled. Before, larger variances would even weights out, and these enlarge variances.
+        size = torch.where(is_held, dispersion.of_errors, dispersion.of_residuals)
+        found = (size[problem.component] / step.weight).clamp(min=priors.least_square / 2)
         variance = torch.where(is_open[problem.component], found, variance)
-        length = (step.decrement / (dispersion * problem.num_nodes)).sqrt()
+        length = (step.decrement / (dispersion.of_residuals * problem.num_nodes)).sqrt()
         stretch = torch.where(length < priors.stretched, priors.relaxation, 1.0)
         orientations, steps = _turned(orientations, stretch[problem.component] * step.turn), steps + is_open
         is_open = is_open & (length >= priors.converged) & (steps < max_steps)
@@ -217,6 +221,7 @@ def _by_density(problem: Problem, settled: Settled, weights: EdgeWeights, max_st
     priors, prior = problem.priors, weights.shaped
     orientations, noise, variance, _ = settled
     density: NoiseDensity | None = None
+    total: Tensor | None = None
     is_open, number = max_steps > 0, 0
     while bool(is_open.any()):
         unit = None if weights.unit is None else _in_world(weights.unit, orientations, problem.graph.target)
@@ -230,12 +235,13 @@ def _by_density(problem: Problem, settled: Settled, weights: EdgeWeights, max_st
                 break
         measure = measure._replace(weigh=density.weigh)
         pooled = problem.pooled(orientations, measure, prior)
-        dispersion = problem.dispersion(sample, measure, pooled)
+        dispersion = problem.dispersion(sample, measure, pooled, total)
         step = problem.step(orientations, measure, pooled, is_open)
-        of_other = (dispersion[problem.component] / step.weight).clamp(min=priors.least_square / 2)
+        total = step.weight
+        of_other = (dispersion.of_errors[problem.component] / step.weight).clamp(min=priors.least_square / 2)
         variance = torch.where(density.is_other[problem.component], of_other, variance)
         orientations = _turned(orientations, step.turn)
-        length = (step.decrement / (dispersion * problem.num_nodes)).sqrt()
+        length = (step.decrement / (dispersion.of_residuals * problem.num_nodes)).sqrt()
         number += 1
         is_open = is_open & (length >= priors.converged) & (max_steps > number)
     return orientations

@@ -64,6 +64,25 @@ class Step(NamedTuple):
         )
 
 
+class Dispersion(NamedTuple):
+    """Mean squares φ ``(C,)`` of each component's weighted residuals and errors, so that φ / Σ w is a node's variance.
+
+    The answer follows its edges: an edge's squared residual is 1 − h times its squared error. h is its leverage, its
+    share in the weights of its two ends, N − 1 in all.
+
+    Attributes:
+        of_residuals: Σ w² rᵀ Ω r / Σ w.
+        of_errors: Σ w² rᵀ Ω r / Σ w (1 − h).
+    """
+
+    of_residuals: Tensor
+    of_errors: Tensor
+
+    def but(self, chosen: Tensor, other: Dispersion) -> Dispersion:
+        """The same but for the chosen components ``(C,)``, which are ``other``'s."""
+        return Dispersion(*(torch.where(chosen, *both) for both in zip(other, self, strict=True)))
+
+
 class Problem:
     """What stays the same from step to step, for a graph of C components."""
 
@@ -154,15 +173,16 @@ class Problem:
     def pooled(self, orientations: Tensor, measure: Measure, prior: Tensor) -> Tensor:
         """Prior weights ``(M,)`` under which edges in series weigh according to their expected errors.
 
-        Their squared residuals give only their total error. Each edge is expected to have its share of the blame in it.
+        Their squared residuals, and their ends' variances, give only their total error. Each edge is expected to have
+        its share of the blame in it.
         """
         series = self.series
         if len(series.edge) == 0:
             return prior
         own = self._errors(self._in_series, series.edge, orientations, measure)
-        together = series.sums(own.square)[series.group]
-        squares = (series.blame * together, own.square)
-        weights = (measure.weigh(square + own.variance, series.edge) for square in squares)
+        expected = own.square + own.variance
+        shared = (series.blame * series.sums(expected)[series.group]).clamp(min=self.priors.least_square)
+        weights = (measure.weigh(square, series.edge) for square in (shared, expected))
         pooled = prior.clone()
         pooled[series.edge] *= (next(weights) / next(weights)).to(prior)
         return pooled
@@ -205,11 +225,23 @@ class Problem:
         ends = (rows.index_select(1, end) for end in (sample.source, sample.target))
         return Expected.of(sample.vector, *ends)
 
-    def dispersion(self, sample: ResidualSample, measure: Measure, prior: Tensor) -> Tensor:
-        """φ of each component, ``(C,)``, from sampled residuals in their units."""
+    def dispersion(self, sample: ResidualSample, measure: Measure, prior: Tensor, total: Tensor | None) -> Dispersion:
+        """φ of each component, from sampled residuals in their units.
+
+        Args:
+            total: ``(N,)`` total weight of each node's edges in the step before; None: all edges weigh the same.
+        """
         expected = self._expected(sample, measure)
         weight = measure.weigh(expected.square + expected.variance, self._chosen) * prior[self._chosen]
-        return self._sum_of_some(weight * weight * expected.square) / self._sum_of_some(weight)
+        ends = (sample.source, sample.target)
+        if total is None:
+            shares = [1 / self.degree[end].to(weight) for end in ends]
+        else:
+            shares = [weight / total[end].to(weight) for end in ends]
+        leverage = (1 - 1 / self.num_nodes.to(weight))[self._component_of_some] * (shares[0] + shares[1])
+        square, whole = self._sum_of_some(weight * weight * expected.square), self._sum_of_some(weight)
+        free = self._sum_of_some(weight * (1 - leverage).clamp(min=0))
+        return Dispersion(square / whole, square / free.clamp(min=self.priors.least_prior * whole))
 
     def _sum_of_some(self, value: Tensor) -> Tensor:
         """Sums ``(C,)`` over each component of the sampled edges' values ``(K,)``."""
