@@ -96,15 +96,21 @@ class Turned:
 
     def densities(self, one: int, found: Difference, widths: tuple[float, ...]) -> tuple[float, np.ndarray]:
         """The squared turn, in standard deviations; densities of the shift given it, with these variances."""
+        square, mean, left = self._given_turn(one, found)
+        return square, np.array([multivariate_normal(mean, width * left).pdf(found.off) for width in widths])
+
+    def heights(self, one: int, found: Difference, widths: tuple[float, ...]) -> np.ndarray:
+        """The largest values of these densities."""
+        _, mean, left = self._given_turn(one, found)
+        return np.array([multivariate_normal(mean, width * left).pdf(mean) for width in widths])
+
+    def _given_turn(self, one: int, found: Difference) -> tuple[float, np.ndarray, np.ndarray]:
         k = self.axes.turns.shape[1]
         total = self.covariance[one] + block_diag(found.of_turn * np.eye(k), found.of_shift)
         inverse = np.linalg.inv(total[:k, :k])
-        mean, left = (
-            total[k:, :k] @ inverse @ found.turned,
-            total[k:, k:] - total[k:, :k] @ inverse @ total[:k, k:],
-        )
-        each = [multivariate_normal(mean, width * left).pdf(found.off) for width in widths]
-        return float(found.turned @ inverse @ found.turned), np.array(each)
+        mean = total[k:, :k] @ inverse @ found.turned
+        left = total[k:, k:] - total[k:, :k] @ inverse @ total[:k, k:]
+        return float(found.turned @ inverse @ found.turned), mean, left
 
 
 @pytest.mark.parametrize("planar", [True, False])
@@ -113,7 +119,9 @@ class Turned:
 def test_each_counts_all_that_are_turned_like_those_near_it(planar: bool, in_order: bool, seed: int) -> None:
     rng = np.random.default_rng(seed)
     false = Turned.draw(rng, planar=planar)
-    chance, log_alone = rng.uniform(0.1, 1.0, COUNT), rng.normal(size=COUNT) - 4
+    # From a map that is hardly broader than the kernels to one by far broader.
+    chance, log_alone = rng.uniform(0.1, 1.0, COUNT), rng.uniform(-16, -4, COUNT)
+    broad = 0
     tells = np.flatnonzero(rng.random(COUNT) < 0.8)
     everybody = np.arange(COUNT)
     among = Near(tells, tells, places_near(tells, tells, np.ones(len(tells), dtype=bool), WINDOW))
@@ -146,10 +154,16 @@ def test_each_counts_all_that_are_turned_like_those_near_it(planar: bool, in_ord
             )
             mean = Difference(turned, off, of_turn, np.eye(len(off)) / weight.sum())
             square, same = false.densities(one, mean, (1.0, 16.0))
+            height = false.heights(one, mean, (1.0, 16.0))
+            # A hundredth of anywhere: of what has that mean density over its own values.
+            tells_nothing = height < 100 * np.exp(log_alone[one] + len(off) / 2)
+            broad += int(tells_nothing.sum())
+            same = np.where(tells_nothing, np.exp(log_alone[one]), same)
             weights.append(chance[other] * np.exp(-square / 2))
             total += weights[-1] * same
         assert surely[one] == pytest.approx(min(sum(weights), 1.0), rel=1e-4)
         np.testing.assert_allclose(density[one], total / max(sum(weights), 1.0), rtol=1e-4, atol=1e-12)
+    assert broad > 0
 
 
 @pytest.mark.parametrize("planar", [True, False])

@@ -20,6 +20,9 @@ from rotavg_ros.solver.slam.poses.repeats.exactness import mean
 _BROADER = 16.0
 # Number of variances for closures anywhere, and for those that follow each other.
 WIDTHS, WIDTHS_AFTER = 2, 3
+# Largest volume of a density that tells anything, as a share of that of shifts to anywhere: the share of random closures
+# that meet it by chance.
+_COVERS = 0.01
 # Turns are alike up to this many standard deviations.
 _FARTHEST = 4.0
 # Probabilities of being the same turn that are smaller than this are neglected.
@@ -131,6 +134,7 @@ def repeated_density(
             _fill_evenly(spread, 1 / total)
             square, squares, volume = _whitened(turned, c, difference, (of_turn / total**2, spread), root)
             _fill(same, squares, volume, size - k)
+            _tell_nothing_if_broad(same, volume, size - k, math.exp(log_alone[c]))
             weight = chance[tells[t]] * math.exp(-square / 2)
             surely[c] += weight
             for width in range(WIDTHS):
@@ -303,4 +307,23 @@ def _fill(same: np.ndarray, squares: float, volume: float, components: int) -> N
     for width in range(len(same)):
         same[width] = math.exp(-squares / 2) / volume
         squares /= _BROADER
+        volume *= _BROADER ** (components / 2)
+
+
+@compiled
+def _tell_nothing_if_broad(same: np.ndarray, volume: float, components: int, alone: float) -> None:
+    """Set densities ``(W,)`` that cover much of the map to the density without any relation.
+
+    That one is the geometric mean of a normal density over its own values. Random closures, each under the likelier of
+    it and a kernel nearly as broad, would seem to repeat others.
+
+    Args:
+        same: to be changed, the narrowest first.
+        volume: inverse of the narrowest's height.
+        components: m.
+        alone: the density without any relation.
+    """
+    for width in range(len(same)):
+        if volume * alone * math.exp(components / 2) > _COVERS:
+            same[width] = alone
         volume *= _BROADER ** (components / 2)
