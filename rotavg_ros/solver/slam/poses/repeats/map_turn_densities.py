@@ -20,8 +20,8 @@ from rotavg_ros.solver.slam.poses.repeats.exactness import mean
 _BROADER = 16.0
 # Number of variances for closures anywhere, and for those that follow each other.
 WIDTHS, WIDTHS_AFTER = 2, 3
-# Largest volume of a density that tells anything, as a share of that of shifts to anywhere: the share of random closures
-# that meet it by chance.
+# Largest volume of a density that tells anything, as a share of that of shifts to anywhere. It is the share of random
+# closures that meet it by chance.
 _COVERS = 0.01
 # Turns are alike up to this many standard deviations.
 _FARTHEST = 4.0
