@@ -106,7 +106,7 @@ def polish_fully(problem: Problem, state: State) -> tuple[State, Evaluation]:
     while True:
         before = evaluation.total
         state, evaluation = polish(problem, state)
-        if evaluation.total > before - problem.limits.slack:
+        if not evaluation.total < before - problem.limits.slack:
             return state, evaluation
 
 

@@ -45,9 +45,13 @@ def without_slips(rival: Rival) -> Rival:
 
 
 def _gained_by_mending(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
-    """``(n,)`` predicted gains in nats if each slipped segment of the chain is sound, and these segments ``(n,)``."""
+    """``(n,)`` predicted gains in nats if each slipped segment of the chain is sound, and these segments ``(n,)``.
+
+    Of those that nobody has rejected.
+    """
     problem, solved = pose.problem, pose.solved
-    slipped = np.flatnonzero(problem.slipped)
+    told = problem.mode.problem.log_odds[: problem.drawn.num_segments]
+    slipped = np.flatnonzero(problem.slipped & np.isfinite(told))
     if len(slipped) == 0:
         return np.zeros(0), slipped
     back = np.linalg.inv(_whitening(problem, pose)[slipped])
