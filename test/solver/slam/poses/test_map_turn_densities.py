@@ -155,8 +155,8 @@ def test_each_counts_all_that_are_turned_like_those_near_it(planar: bool, in_ord
             mean = Difference(turned, off, of_turn, np.eye(len(off)) / weight.sum())
             square, same = false.densities(one, mean, (1.0, 16.0))
             height = false.heights(one, mean, (1.0, 16.0))
-            # A hundredth of anywhere: of what has that mean density over its own values.
-            tells_nothing = height < 100 * np.exp(log_alone[one] + len(off) / 2)
+            # A tenth of anywhere: of what has that mean density over its own values.
+            tells_nothing = height < 10 * np.exp(log_alone[one] + len(off) / 2)
             broad += int(tells_nothing.sum())
             same = np.where(tells_nothing, np.exp(log_alone[one]), same)
             weights.append(chance[other] * np.exp(-square / 2))

@@ -1,4 +1,4 @@
-"""Slips that places know better, and labels of rotations that places alone would set."""
+"""Slips that places know better."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ import torch
 from rotavg_ros.solver.neurora.network_store import load_network
 from rotavg_ros.solver.slam import stages
 from rotavg_ros.solver.slam.network import SlamCleanNet
-from rotavg_ros.solver.slam.poses.closures import REPEATS
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
 from rotavg_ros.solver.slam.poses.search.mending import without_slips
-from rotavg_ros.solver.slam.poses.search.settling import Rival, relabelled, settled, settling
+from rotavg_ros.solver.slam.poses.search.settling import Rival, settled, settling
 from rotavg_ros.solver.slam.posterior.em import polish, polish_fully
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.solve import search
@@ -61,22 +60,6 @@ def test_a_slip_that_closures_tell_of_stays() -> None:
     assert without_slips(rival) is rival
     invented = with_slips(rival, [int(mode.slipped[0]) // 2])
     assert np.array_equal(without_slips(invented).mode.slipped, rival.mode.slipped)
-
-
-@torch.no_grad()
-def test_a_rotation_that_no_good_closure_could_have_stays_false() -> None:
-    """Whatever places say: as the same wrong place as another one, for instance, seen turned by 30°."""
-    graph, translation, found = found_of("building: 30 % random", 6)
-    pose = estimate_poses(PoseProblem(graph, translation, found.modes[0]))
-    square = (pose.solved.predictions.mean[:, : pose.problem.turns] ** 2).sum(axis=1)
-    turned = np.flatnonzero((pose.solved.places.rotation_good < 0.5) & (square > np.radians(30.0) ** 2))
-    assert len(turned) > 10
-    chance = pose.solved.places.chance.copy()
-    chance[:, turned] = 0.0
-    chance[REPEATS, turned] = 1.0
-    places = replace(pose.solved.places, chance=chance)
-    alike = replace(pose, solved=replace(pose.solved, places=places))
-    assert relabelled(alike).is_false[turned].all()
 
 
 @torch.no_grad()

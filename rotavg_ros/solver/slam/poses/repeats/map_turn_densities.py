@@ -22,7 +22,7 @@ _BROADER = 16.0
 WIDTHS, WIDTHS_AFTER = 2, 3
 # Largest volume of a density that tells anything, as a share of that of shifts to anywhere. It is the share of random
 # closures that meet it by chance.
-_COVERS = 0.01
+_COVERS = 0.1
 # Turns are alike up to this many standard deviations.
 _FARTHEST = 4.0
 # Probabilities of being the same turn that are smaller than this are neglected.

@@ -14,13 +14,10 @@ from rotavg_ros.solver.slam.poses.em.convergence import Ending
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
-from rotavg_ros.solver.slam.poses.row_errors import closure_turns
 from rotavg_ros.solver.slam.poses.search.jumps import log_jump_prior
 from rotavg_ros.solver.slam.poses.solved import PoseMode
-from rotavg_ros.solver.slam.posterior.densities import log_good
 from rotavg_ros.solver.slam.posterior.em import polish_fully
 from rotavg_ros.solver.slam.posterior.mode import Mode
-from rotavg_ros.solver.slam.posterior.rows import tails
 
 # Maximum number of rounds of relabelling; least decrease of −log p for another round, nats; and distance from the least
 # −log p so far at which a labelling is given up, nats.
@@ -114,24 +111,8 @@ def relabelled(pose: PoseMode) -> Mode:
     if "relabelling" in problem.without:
         return before
     trusted = before.state.trusted.copy()
-    is_good = (pose.solved.places.rotation_good > _GOOD) & _could_be_good(pose)
-    trusted[closure] = np.where(is_told, trusted[closure], is_good)
+    trusted[closure] = np.where(is_told, trusted[closure], pose.solved.places.rotation_good > _GOOD)
     if np.array_equal(trusted, before.state.trusted):
         return before
     state = replace(before.state, correction=pose.state.correction, trusted=trusted)
     return Mode(problem, *polish_fully(problem, state), before.origin)
-
-
-def _could_be_good(pose: PoseMode) -> np.ndarray:
-    """``(C,)`` bool, closures whose turns are those of good ones, not of false ones, or that join the right places.
-
-    A wrong place that looks alike may be seen turned by more than good closures err. Rotations alone know only good and
-    false: a map in which such a closure is good bends until it fits.
-    """
-    problem, solved = pose.problem, pose.solved
-    k, rotations = problem.turns, problem.mode.problem
-    square = (solved.predictions.mean[:, :k] ** 2).sum(axis=1)
-    spread = np.diagonal(solved.predictions.covariance[:, :k, :k], axis1=1, axis2=2).mean(axis=1)
-    tailed = tails(rotations, problem.mode.state.noise).of(rotations.closure)
-    good, _ = log_good(square, closure_turns(problem, solved.state.noise), spread, k, tailed)
-    return np.asarray((good > problem.told.false_odds) | (solved.places.right > _GOOD))
