@@ -27,7 +27,7 @@ _LEAST_MEMBERS = 2
 
 
 def propose_rejected_runs(mode: Mode) -> Iterator[Proposal]:
-    """Proposes to reject the runs of good closures that all other edges support least."""
+    """Proposes to reject runs of good closures: of a large common residual, or that all other edges hardly support."""
     problem, limits = mode.problem, mode.problem.limits
     runs = _runs(mode)
     if not runs:
@@ -47,8 +47,8 @@ def propose_rejected_runs(mode: Mode) -> Iterator[Proposal]:
 def _runs(mode: Mode) -> list[tuple[np.ndarray, float, np.ndarray]]:
     """Good closures ``(K,)`` of runs, with what all other edges say of them (:func:`_without`).
 
-    The least supported runs first: their density is lowest, in units of what their closures themselves allow. Where
-    there are too many closures for that, of the runs whose summed residual is the most standard deviations.
+    Of the runs whose summed residual is the most standard deviations. Then the least supported of the others, whose
+    density is lowest in units of what their closures themselves allow, unless there are too many closures for that.
     """
     problem, is_good = mode.problem, ~mode.is_false & ~np.isinf(mode.problem.log_odds[mode.problem.closure])
     own = variances(problem, mode.state.noise)[problem.closure]
@@ -57,15 +57,15 @@ def _runs(mode: Mode) -> list[tuple[np.ndarray, float, np.ndarray]]:
     square = (total**2).sum(axis=1) / np.maximum(np.bincount(problem.run, own * is_good), np.finfo(np.float64).tiny)
     order = np.argsort(-square, kind="stable")
     chosen = order[np.bincount(problem.run, is_good)[order] >= _LEAST_MEMBERS]
-    if not mode.covariance_is_cheap:
-        chosen = chosen[: problem.limits.candidates]
+    most = problem.limits.candidates
     found: list[tuple[float, tuple[np.ndarray, float, np.ndarray]]] = []
-    for run in chosen:
+    for run in chosen if mode.covariance_is_cheap else chosen[:most]:
         members = np.flatnonzero(is_good & (problem.run == run))
         if (told := _without(mode, members)) is not None:
             support = told[0] + problem.components / 2 * float(np.log(own[members]).sum())
             found.append((support, (members, *told)))
-    return [run for _, run in sorted(found, key=lambda each: each[0])[: problem.limits.candidates]]
+    others = sorted(found[most:], key=lambda each: each[0])[:most]
+    return [run for _, run in (*found[:most], *others)]
 
 
 def _without(mode: Mode, members: np.ndarray) -> tuple[float, np.ndarray] | None:
