@@ -47,8 +47,8 @@ def propose_rejected_runs(mode: Mode) -> Iterator[Proposal]:
 def _runs(mode: Mode) -> list[tuple[np.ndarray, float, np.ndarray]]:
     """Good closures ``(K,)`` of runs, with what all other edges say of them (:func:`_without`).
 
-    Of the runs whose summed residual is the most standard deviations. Then the least supported of the others, whose
-    density is lowest in units of what their closures themselves allow, unless there are too many closures for that.
+    First the runs whose summed residual is the most standard deviations. Then, unless there are too many closures, the
+    others that all else supports least: those of the lowest density, in units of what their closures themselves allow.
     """
     problem, is_good = mode.problem, ~mode.is_false & ~np.isinf(mode.problem.log_odds[mode.problem.closure])
     own = variances(problem, mode.state.noise)[problem.closure]
