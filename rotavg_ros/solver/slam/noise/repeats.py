@@ -17,7 +17,7 @@ from rotavg_ros.solver.algebra.compiled import compiled
 
 # Widths of the kernels: standard deviations of the difference between repeats, degrees.
 REPEAT_DEG = 0.05 * 2.0 ** np.arange(9)
-# Kernels: either of one of the widths for all closures, or of all widths, equally likely for each closure.
+# Kernels: either of one of the widths for all closures, or of all widths, drawn for each closure.
 KERNELS = len(REPEAT_DEG) + 1
 # Estimates: over the run, over those detected shortly before, over all.
 _WHOSE = 3
@@ -74,19 +74,24 @@ class Repeats(NamedTuple):
         """For n closures that are compared with no others."""
         return cls(np.zeros((_WHOSE, KERNELS, count)), np.zeros((_WHOSE, count), dtype=np.bool_))
 
-    def no_narrower(self, width: float, alone: np.ndarray) -> Repeats:
-        """The same with the density ``(n,)`` of no repeat for kernels narrower than ``width``, rad.
 
-        What is mistaken again is measured again, with the noise of a closure. Narrower kernels make right closures
-        false that all contradict odometry by exactly the same turn. They fade over an octave, so that F is continuous.
-        """
-        octave = np.log2(max(np.degrees(width), REPEAT_DEG[0]) / REPEAT_DEG[0])
-        share = np.clip(1 + np.arange(KERNELS - 1) - octave, 0.0, 1.0)[:, None]
-        density = share * self.density[:, :-1] + (1 - share) * alone
-        return self._replace(density=np.concatenate((density, density.mean(axis=1, keepdims=True)), axis=1))
+def log_widths(usual: float, spread: float) -> np.ndarray:
+    """``(S − 1,)`` log probabilities of the kernels' widths.
+
+    What is mistaken again is measured again, so false closures that repeat each other agree about as well as good ones
+    do. How much better is as uncertain as any noise is: log-normal. Without this, right closures are false that all
+    contradict odometry by exactly the same turn. How much worse depends on the places: all such widths are equally
+    likely.
+
+    Args:
+        usual: rad, standard deviation of the difference between two good closures of the same places.
+        spread: standard deviation of the logarithm of a noise.
+    """
+    log = -((np.minimum(np.log(np.radians(REPEAT_DEG) / usual), 0.0) / spread) ** 2) / 2
+    return np.asarray(log - np.logaddexp.reduce(log))
 
 
-def repeats(closures: Closures, near: Near, gap: float, components: int) -> Repeats:
+def repeats(closures: Closures, near: Near, gap: float, components: int, log_width: np.ndarray) -> Repeats:
     """Estimates for some closures.
 
     Args:
@@ -94,8 +99,9 @@ def repeats(closures: Closures, near: Near, gap: float, components: int) -> Repe
         near: n of them, and the false ones that they are compared with.
         gap: steps; ends at most this far apart are near each other.
         components: k.
+        log_width: ``(S − 1,)`` log probabilities of widths that are drawn for each closure.
     """
-    density, total = _repeats(closures, near, gap, _Kernels.of(components))
+    density, total = _repeats(closures, near, gap, _Kernels.of(components), np.exp(log_width))
     return Repeats(density, total > 0)
 
 
@@ -136,7 +142,9 @@ def places_near(when: np.ndarray, asked: np.ndarray, is_one: np.ndarray | None, 
 
 
 @compiled
-def _repeats(closures: Closures, compared: Near, gap: float, kernels: _Kernels) -> tuple[np.ndarray, np.ndarray]:
+def _repeats(
+    closures: Closures, compared: Near, gap: float, kernels: _Kernels, share: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     older, newer, turn, is_told = closures
     rows, false, between = compared
     height, least_cosine = kernels.height, kernels.least_cosine
@@ -185,5 +193,5 @@ def _repeats(closures: Closures, compared: Near, gap: float, kernels: _Kernels) 
         for whose in range(_WHOSE):
             for s in range(widths):
                 density[whose, s, n] = summed[whose, s] * height[s] / max(total[whose, n], 1.0)
-                density[whose, widths, n] += density[whose, s, n] / widths
+                density[whose, widths, n] += density[whose, s, n] * share[s]
     return density, total

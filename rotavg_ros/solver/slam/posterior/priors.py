@@ -18,7 +18,8 @@ class SlamPriors:
         step_deg: median of the standard deviation of one step of odometry.
         closure_deg: the same for a good closure; also the standard deviation of the error in the stated mounting of the
             closures' sensor.
-        noise_spread: standard deviation of the logarithm of both standard deviations.
+        noise_spread: standard deviation of the logarithm of both standard deviations, and of that between false
+            closures that repeat each other, where they agree better than good ones.
         tails: probability that odometry has heavy tails (some sound segments err by far more than others), and likewise
             for good closures; all values of the grid of shares are equally likely
             (:mod:`rotavg_ros.solver.slam.posterior.state`).

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.solver.slam.noise.repeats import KERNELS, REPEAT_DEG, Closures, Near, places_near, repeats
+from rotavg_ros.solver.slam.noise.repeats import KERNELS, REPEAT_DEG, Closures, Near, log_widths, places_near, repeats
 
 GAP, WINDOW = 30.0, 6
 
@@ -27,7 +28,8 @@ def test_densities_are_means_over_a_run_those_before_and_all(
     is_told, false = rng.random(count) < 0.9, np.flatnonzero(rng.random(count) < 0.7)
     rows = np.arange(count)
     between = places_near(false, rows, np.isin(rows, false) if both_sides else None, WINDOW)
-    found = repeats(Closures(older, newer, turn.as_quat(), is_told), Near(rows, false, between), GAP, components)
+    closures, near, drawn = Closures(older, newer, turn.as_quat(), is_told), Near(rows, false, between), rng.random(9)
+    found = repeats(closures, near, GAP, components, np.log(drawn / drawn.sum()))
 
     width = np.radians(REPEAT_DEG)
     for row in rows:
@@ -50,7 +52,7 @@ def test_densities_are_means_over_a_run_those_before_and_all(
             expected = weight @ kernels / max(weight.sum(), 1.0)
             # Kernels end at five widths of the broadest.
             np.testing.assert_allclose(density[:-1, row], expected, rtol=1e-6, atol=1e-5 * width[-1] ** -components)
-            assert density[-1, row] == pytest.approx(density[:-1, row].mean())
+            assert density[-1, row] == pytest.approx(np.average(density[:-1, row], weights=drawn))
 
 
 def test_nobody_is_near_itself() -> None:
@@ -60,23 +62,10 @@ def test_nobody_is_near_itself() -> None:
     assert places_near(when, rows, None, 2)[:, 2:].tolist() == [[3, 3]] * 4
 
 
-@pytest.mark.parametrize("narrowest", [0.0, 0.05, 0.3, 0.4, 20.0])
-def test_no_kernel_is_narrower_than_a_repeat_is_measured(narrowest: float) -> None:
-    """Kernels below it say nothing of repeats; the one next to it does in part, by its distance in octaves."""
-    alone = 0.7
-    for angle in np.radians([0.0, 0.02, 0.5, 3.0]):
-        turn = Rotation.from_rotvec([[0, 0, 0.0], [0, 0, angle]]).as_quat()
-        closures = Closures(np.array([0.0, 1.0]), np.array([500.0, 501.0]), turn, np.ones(2, dtype=bool))
-        near = Near(np.array([1]), np.array([0]), np.array([[0, 1, 1, 1]]))
-        plain = repeats(closures, near, GAP, 1)
-        found = plain.no_narrower(np.radians(narrowest), np.array([alone]))
-        np.testing.assert_array_equal(found.has_any, plain.has_any)
-        for width, before, after in zip(REPEAT_DEG, plain.density[0, :, 0], found.density[0, :, 0], strict=False):
-            if width >= narrowest:
-                assert after == pytest.approx(before)
-            elif width <= narrowest / 2:
-                assert after == alone
-            else:
-                share = 1 - np.log2(narrowest / width)
-                assert after == pytest.approx(share * before + (1 - share) * alone)
-        np.testing.assert_allclose(found.density[:, -1], found.density[:, :-1].mean(axis=1))
+@pytest.mark.parametrize("usual_deg", [0.05, 0.4, 3.0])
+def test_kernels_are_about_as_wide_as_good_closures_differ(usual_deg: float) -> None:
+    """Log-normal below, relative to the widest; all that are wider are equally likely."""
+    log, spread = log_widths(np.radians(usual_deg), 0.7), 0.7
+    assert np.exp(log).sum() == pytest.approx(1.0)
+    below = stats.norm.logpdf(np.log(np.minimum(REPEAT_DEG, usual_deg)), np.log(usual_deg), spread)
+    np.testing.assert_allclose(log - log[-1], below - below[-1], atol=1e-9)

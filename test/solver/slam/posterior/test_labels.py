@@ -23,6 +23,8 @@ from rotavg_ros.view_graph import ViewGraph
 
 from .planar import planar, problem_of, yaw
 
+CLOSURE_VARIANCE = 1e-4
+
 
 @pytest.mark.parametrize("seed", range(5))
 def test_prior_log_odds_of_labels_are_differences_of_their_prior(seed: int) -> None:
@@ -59,9 +61,15 @@ def test_priors_are_normalised() -> None:
         residual = np.zeros((len(problem.closure), 3))
         residual[second, 2] = turn
         densities.append(
-            np.exp(false_density(problem, is_false, Discrepancies(residual, exact, 0.0), second).log_sums())
+            np.exp(
+                false_density(problem, is_false, Discrepancies(residual, exact, CLOSURE_VARIANCE), second).log_sums()
+            )
         )
     np.testing.assert_allclose(np.trapezoid(densities, turns, axis=0), 1.0, atol=0.02)
+    # Rates, and widths of kernels, of which nothing tells yet.
+    nothing = np.flatnonzero(is_false)[:0]
+    nobody = false_density(problem, is_false, Discrepancies(residual, exact, CLOSURE_VARIANCE), nothing)
+    assert log_false_set(problem, nobody) == pytest.approx(0.0, abs=1e-9)
     chain = problem_of(ViewGraph.create(np.arange(6), np.arange(1, 7), yaw(np.zeros(6)), kind=[0] * 6))
     # Every node an end of closures would make six segments of one step; here their prior is asked for as if.
     steps = replace(chain, graph=replace(chain.graph, own_steps=np.ones(6), is_odometry=np.ones(6, dtype=bool)))
@@ -80,7 +88,7 @@ def _drawn_density(count: int) -> tuple[FalseDensity, np.ndarray]:
     any_one = (1 - far) * alone[:, None] + far * of_others[2]
     mixed = (1 - run) * ((1 - before) * any_one + before * of_others[1]) + run * of_others[0]
     number = rng.integers(0, count // 5, count)
-    return FalseDensity(alone, Repeats(of_others, has_any), number), mixed.reshape(9, -1, count)
+    return FalseDensity(alone, Repeats(of_others, has_any), number, np.zeros(10)), mixed.reshape(9, -1, count)
 
 
 def test_the_mean_over_rates_is_that_of_the_mixture() -> None:
@@ -125,7 +133,7 @@ def test_runs_that_repeat_one_turn_are_cheap_though_others_repeat_none() -> None
         residual = np.stack((np.zeros(26), np.zeros(26), turn), axis=1)
         for name, is_false in (("both", np.ones(26, dtype=bool)), ("scattered", is_scattered)):
             rows = np.flatnonzero(is_false)
-            density = false_density(problem, is_false, Discrepancies(residual, np.zeros(26), 0.0), rows)
+            density = false_density(problem, is_false, Discrepancies(residual, np.zeros(26), CLOSURE_VARIANCE), rows)
             cost[name, without] = -log_false_set(problem, density)
     repeating = [cost["both", without] - cost["scattered", without] for without in ((), ("own-repeats",))]
     assert repeating[0] < repeating[1] - 2.0

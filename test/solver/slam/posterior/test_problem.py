@@ -64,7 +64,7 @@ def _repeated(problem: Problem) -> FalseDensity:
     is_false = np.arange(len(problem.closure)) == first
     count = len(problem.closure)
     return false_density(
-        problem, is_false, Discrepancies(np.zeros((count, 3)), np.zeros(count), 0.0), np.array([second])
+        problem, is_false, Discrepancies(np.zeros((count, 3)), np.zeros(count), 1e-4), np.array([second])
     )
 
 

@@ -14,11 +14,11 @@ from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
-from rotavg_ros.solver.slam.noise.repeats import KERNELS, Closures, Near, Repeats, places_near, repeats
+from rotavg_ros.solver.slam.noise.repeats import KERNELS, Closures, Near, Repeats, log_widths, places_near, repeats
 from rotavg_ros.solver.slam.posterior.densities import anyhow, log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
-from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, State
+from rotavg_ros.solver.slam.posterior.state import State
 
 # Grids that replace integrals over rates: the shares of false closures that repeat the turn of their run, of one
 # shortly before, and of any other; and the share of near misses among those that repeat none.
@@ -74,9 +74,9 @@ class Discrepancies(NamedTuple):
         return cls(residual[closure], state.others.predicted[closure], state.noise.closure_variance)
 
     @property
-    def least_between_repeats(self) -> float:
-        """Rad, standard deviation of the difference between two closures that share all but their own noise."""
-        return math.sqrt(2 * (1 - max(COMMON_SHARES)) * self.closure_variance)
+    def between_good(self) -> float:
+        """Rad, standard deviation of the difference between two good closures of the same places."""
+        return math.sqrt(2 * self.closure_variance)
 
 
 @dataclass(frozen=True)
@@ -92,11 +92,13 @@ class FalseDensity:
             about the vertical, if there is one.
         repeats: densities given the turns of other closures, where there are such.
         run: ``(n,)`` number of each closure's run.
+        log_kernel: ``(S,)`` log probability of each kernel, relative to equal ones.
     """
 
     alone: np.ndarray
     repeats: Repeats
     run: np.ndarray
+    log_kernel: np.ndarray
 
     def log_sums(self) -> np.ndarray:
         """``(G,)`` log density of all closures jointly, at each point of the grid of rates.
@@ -248,8 +250,10 @@ def false_density(
         ratio = problem.vertical.density_ratio(residual[rows], predicted[rows])
         alone = np.concatenate((alone, alone + _ABOUT_VERTICAL * uniform * (ratio - 1)))
     run = problem.run[rows]
+    log_width = log_widths(off.between_good, problem.priors.noise_spread)
+    log_kernel = np.append(log_width + np.log(len(log_width)), 0.0)
     if count == 0 or not is_false.any() or "repeats" in problem.without:
-        return FalseDensity(alone, Repeats.none(count), run)
+        return FalseDensity(alone, Repeats.none(count), run, log_kernel)
     older, newer = problem.ends.T
     turn = np.ascontiguousarray(quaternion_rows.exp((residual * problem.sign[:, None]).T).T)
     # If nothing else predicts a closure, the turn by which it is wrong is unknown.
@@ -258,8 +262,8 @@ def false_density(
     is_one = is_false[rows] if both_sides else None
     between = places_near(problem.detected[false], problem.detected[rows], is_one)
     closures, near = Closures(older, newer, turn, is_told), Near(rows, false, between)
-    repeated = repeats(closures, near, problem.priors.run_gap_steps, k)
-    return FalseDensity(alone, repeated.no_narrower(off.least_between_repeats, alone.mean(axis=0)), run)
+    repeated = repeats(closures, near, problem.priors.run_gap_steps, k, log_width)
+    return FalseDensity(alone, repeated, run, log_kernel)
 
 
 def _near_miss_shares(priors: SlamPriors) -> np.ndarray:
@@ -271,6 +275,8 @@ def _near_miss_shares(priors: SlamPriors) -> np.ndarray:
 @cache
 def _log_repeat_prior(priors: SlamPriors, kinds: int, has_own: bool) -> np.ndarray:
     """``(G,)`` log prior of the grid's points: Beta(1, count) for the share of repeats elsewhere, else uniform.
+
+    That of kernels depends on the noise of closures and comes with the density.
 
     With probability :data:`_OWN_SHARES` each run has its own shares; otherwise all have the same.
     """
@@ -284,8 +290,8 @@ def _log_repeat_prior(priors: SlamPriors, kinds: int, has_own: bool) -> np.ndarr
 
 def _log_weighted(problem: Problem, density: FalseDensity) -> np.ndarray:
     """``(G,)`` log of the prior times the density of all false closures, at the grid's points."""
-    has_own = "own-repeats" not in problem.without
-    return np.asarray(density.log_sums() + _log_repeat_prior(problem.priors, len(density.alone), has_own))
+    prior = _log_repeat_prior(problem.priors, len(density.alone), "own-repeats" not in problem.without)
+    return np.asarray(density.log_sums() + (prior.reshape(-1, KERNELS) + density.log_kernel).ravel())
 
 
 def repeat_rates(problem: Problem, density: FalseDensity) -> np.ndarray:
