@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -53,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     if trainer.epochs_done:
         print(f"going on after epoch {trainer.epochs_done} of {config.epochs}", flush=True)
     trainer.run()
-    card = json.loads(trainer.card_path.read_text())
+    card = trainer.card()
     figures = ", ".join(f"{name} {value:.4g}" for name, value in card["validation"].items())
     print(f"{trainer.weights_path}: epoch {card['epoch']} of {config.epochs}, {figures}")
     return 0

@@ -7,7 +7,7 @@ import json
 import math
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -70,7 +70,7 @@ class Trainer:
     Args:
         task: network and data.
         config: the run's configuration.
-        folder: created if missing; a checkpoint there is resumed, one of another run is refused.
+        folder: created if missing; a checkpoint there is resumed; one of another run is refused, and so are weights.
         name: of the network, as in :data:`rotavg_ros.solver.networks.NETWORKS`.
         inputs: other inputs that decide the outcome (fingerprints of other networks), for card and checkpoint.
         command: the command that repeats the run, for the card.
@@ -105,6 +105,8 @@ class Trainer:
             )
             self._state = _State(**state)
             self._check_best()
+        else:
+            self._check_free()
         with self._writing():
             self._drop_log_after(self._state.epoch)
 
@@ -209,12 +211,13 @@ class Trainer:
     def _identity(self) -> dict[str, Any]:
         return {**metadata(self.name), "config": self.config.to_dict(), **self.inputs}
 
+    def _origin(self) -> dict[str, Any]:
+        """What its card says of how to repeat the run."""
+        return {"network": self.name, "command": self.command, "config": self.config.to_dict(), **self.inputs}
+
     def _save_weights(self, figures: dict[str, float]) -> None:
         card = {
-            "network": self.name,
-            "command": self.command,
-            "config": self.config.to_dict(),
-            **self.inputs,
+            **self._origin(),
             "epoch": self._state.epoch,
             "hours": round(self._state.seconds / 3600, 3),
             "hardware": _hardware(self.task.network),
@@ -231,12 +234,31 @@ class Trainer:
         with self._log_path.open("a") as log:
             log.write(json.dumps(row) + "\n")
 
+    def card(self) -> dict[str, Any]:
+        """The card of the weights in its folder; empty if it is missing or damaged."""
+        with suppress(OSError, ValueError):
+            card = json.loads(self.card_path.read_text())
+            return card if isinstance(card, dict) else {}
+        return {}
+
     def _check_best(self) -> None:
         """Refuse a checkpoint without the best weights before it, which it does not hold itself."""
+        what = f"put it back, or remove {self._checkpoint_path.name}, which goes on from there, to start anew"
         for path in (self.weights_path, self.card_path):
             if not path.exists():
-                what = f"put it back, or remove {self._checkpoint_path.name}, which goes on from there, to start anew"
                 raise TrainingError(f"{path}: is missing; {what}")
+        if not {"epoch", "validation"} <= self.card().keys():
+            raise TrainingError(f"{self.card_path}: is damaged; {what}")
+
+    def _check_free(self) -> None:
+        """Refuse to begin beside weights of another run, which the first epoch would overwrite.
+
+        Weights of this run without a checkpoint are those of a first epoch that was killed while it was saved.
+        """
+        card = self.card()
+        if self.weights_path.exists() and any(card.get(key) != value for key, value in self._origin().items()):
+            what = "move it away or choose another folder"
+            raise TrainingError(f"{self.weights_path}: is of another run and would be overwritten; {what}")
 
     def _drop_log_after(self, epoch: int) -> None:
         """Remove the log lines of epochs that will be repeated."""

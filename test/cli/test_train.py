@@ -103,6 +103,19 @@ def test_training_goes_on_from_given_weights(config: Path, tmp_path: Path) -> No
     assert main([*command, "--output", str(tmp_path / "out")]) == 2
 
 
+def test_the_network_that_a_training_starts_from_is_not_overwritten(
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Overwritten by the first epoch, it could not be started from again, and the run could not be resumed."""
+    start = tmp_path / "out" / "sfm-clean-net.safetensors"
+    start.parent.mkdir()
+    start.write_bytes(OTHER_WEIGHTS.read_bytes())
+    command = ["train", "clean-net", str(config), *CPU, "--output", str(start.parent), "--start", str(start)]
+    assert main(command) == 2
+    assert f"{start}: is of another run and would be overwritten" in capsys.readouterr().err
+    assert start.read_bytes() == OTHER_WEIGHTS.read_bytes()
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

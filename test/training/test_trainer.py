@@ -21,6 +21,7 @@ from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.network_store import read_network
 from rotavg_ros.solver.neurora.paper import PaperCleanNet
 from rotavg_ros.training import drawing
+from rotavg_ros.training import trainer as trainer_module
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.paper_tasks import PaperCleanTask, PaperFineTask
 from rotavg_ros.training.sfm_tasks import SfmCleanTask, SfmFineTask
@@ -256,6 +257,51 @@ def test_a_checkpoint_without_the_best_weights_is_refused(suffix: str, tmp_path:
     with pytest.raises(UserError, match=rf"sfm-clean-net\{suffix}: is missing; put it back, or remove sfm-clean-net"):
         make_trainer("sfm-clean-net", tmp_path)
     assert log(tmp_path, "sfm-clean-net") == before
+
+
+@pytest.mark.parametrize("content", ["", "[1]", "{}"])
+def test_a_checkpoint_beside_a_damaged_card_is_refused(content: str, tmp_path: Path) -> None:
+    make_trainer("sfm-clean-net", tmp_path).run(max_epochs=1)
+    (tmp_path / "sfm-clean-net.json").write_text(content)
+    with pytest.raises(UserError, match=r"sfm-clean-net\.json: is damaged; put it back"):
+        make_trainer("sfm-clean-net", tmp_path)
+
+
+@pytest.mark.parametrize("card", ["kept", "damaged", "lost"])
+def test_weights_of_another_run_are_not_overwritten(card: str, tmp_path: Path) -> None:
+    """A network that was brought here, or whose checkpoint was removed, is lost with the first epoch otherwise."""
+    make_trainer("sfm-clean-net", tmp_path).run(max_epochs=1)
+    before = load_file(tmp_path / "sfm-clean-net.safetensors")
+    (tmp_path / "sfm-clean-net.checkpoint.safetensors").unlink()
+    if card == "damaged":
+        (tmp_path / "sfm-clean-net.json").write_text("[")
+    elif card == "lost":
+        (tmp_path / "sfm-clean-net.json").unlink()
+    task, config = make_task("sfm-clean-net")
+    with pytest.raises(
+        UserError, match=r"sfm-clean-net\.safetensors: is of another run and would be overwritten; move"
+    ):
+        Trainer(task, replace(config, seed=6), tmp_path, "sfm-clean-net")
+    assert all(
+        torch.equal(value, before[key]) for key, value in load_file(tmp_path / "sfm-clean-net.safetensors").items()
+    )
+
+
+def test_a_run_that_is_killed_before_its_first_checkpoint_begins_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer_module, "save_checkpoint", killed)
+        with pytest.raises(KeyboardInterrupt):
+            make_trainer("sfm-clean-net", tmp_path / "killed").run()
+    assert (tmp_path / "killed" / "sfm-clean-net.safetensors").exists()
+    for folder in ("killed", "unbroken"):
+        make_trainer("sfm-clean-net", tmp_path / folder).run()
+    expected, actual = tensors(tmp_path / "unbroken"), tensors(tmp_path / "killed")
+    assert all(torch.equal(value, actual[key]) for key, value in expected.items())
 
 
 def test_training_reduces_the_loss(tmp_path: Path) -> None:
