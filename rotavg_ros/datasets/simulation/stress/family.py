@@ -125,12 +125,12 @@ class RobotFamily:
             default = getattr(usual, key)
             try:
                 if key == "worlds":
-                    values[key] = tuple(str(world) for world in value)
+                    values[key] = tuple(str(world) for world in _list(value))
                 elif isinstance(default, tuple):
-                    low, high = value
-                    values[key] = float(low), float(high)
+                    low, high = _list(value)
+                    values[key] = _number(low), _number(high)
                 else:
-                    values[key] = float(value)
+                    values[key] = _number(value)
             except (TypeError, ValueError, OverflowError):
                 raise RobotFamilyError(f"{key} is {value!r}, expected like {default!r}") from None
         return cls(**values)
@@ -218,6 +218,20 @@ class RobotFamily:
         if rng.random() < self.heavy:
             level += rng.normal(size=count) * rng.uniform(*self.level_spread)
         return np.exp(level)
+
+
+def _list(value: Any) -> list[Any] | tuple[Any, ...]:
+    """The list; a text and a mapping can be gone through as well, but are none."""
+    if not isinstance(value, list | tuple):
+        raise TypeError(value)
+    return value
+
+
+def _number(value: Any) -> float:
+    """The number; ``float`` would take ``true`` for 1."""
+    if isinstance(value, bool):
+        raise TypeError(value)
+    return float(value)
 
 
 def _smooth(values: FloatArray, steps: float) -> FloatArray:

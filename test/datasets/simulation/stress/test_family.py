@@ -49,6 +49,12 @@ def test_speed_lengthens_steps_where_they_err_more() -> None:
         ({"false_share": [0, 1]}, "false_share is .* between 0 and 0.9"),
         ({"planar_share": 2}, "planar_share is 2.0; use a number between 0 and 1"),
         ({"odometry_deg": "far"}, "odometry_deg is 'far', expected like"),
+        # A text's letters and a mapping's keys are no list, and `true` is no number.
+        ({"odometry_deg": "12"}, "odometry_deg is '12', expected like"),
+        ({"odometry_deg": {0.1: "low", 0.4: "high"}}, "odometry_deg is {.*, expected like"),
+        ({"odometry_deg": [True, True]}, "odometry_deg is .True, True., expected like"),
+        ({"worlds": "building"}, "worlds is 'building', expected like"),
+        ({"even": True}, "even is True, expected like"),
         ({"noise": 1}, "unknown key 'noise'; known are worlds, planar_share"),
         (["worlds"], "expected `key: value` lines, found list"),
     ],
