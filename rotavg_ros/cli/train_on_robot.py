@@ -19,10 +19,12 @@ from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.results import make_folder
 from rotavg_ros.solver.learning.fine_tuning import SlamFineNet
 from rotavg_ros.solver.learning.robot_runs import RobotNoise, RobotRun
-from rotavg_ros.training.own_robot import LEAST_CLOSURES, Verdict, compare, family_of, fine_tune
+from rotavg_ros.training.own_robot import LEAST_CLOSURES, Verdict, compare, configuration, fine_tune
 from rotavg_ros.wording import counted
 
 _TRIED = "tried"
+# Keys of the configuration whose values are what the time allows.
+_BY_TIME = ("graphs", "validation_graphs", "epochs")
 
 
 class OwnRobotError(UserError):
@@ -50,12 +52,11 @@ def run(arguments: argparse.Namespace) -> int:
     noises = [each.noise() for each in runs]
     for path, noise in zip(arguments.runs, noises, strict=True):
         print(f"{path}: {_told(noise)}", flush=True)
-    family = family_of(noises)
+    config = configuration(noises)
     make_folder(tried)
-    plain = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(family).items()}
-    configuration = {"family": "slam", "recipe": "robots", "robots": plain}
-    (tried / "robots.yaml").write_text(yaml.safe_dump(configuration, sort_keys=False))
-    network = fine_tune(family, noises, tried, arguments.minutes, lambda line: print(line, flush=True))
+    stated = {key: value for key, value in config.to_dict().items() if key not in _BY_TIME}
+    (tried / "robots.yaml").write_text(yaml.safe_dump(stated, sort_keys=False))
+    network = fine_tune(config, tried, arguments.minutes, lambda line: print(line, flush=True))
     with working("comparing on stretches that are held back"):
         verdict = compare(runs, network)
     print(_said(verdict))

@@ -105,14 +105,20 @@ def _lengths(noises: Sequence[RobotNoise]) -> tuple[int, int]:
     return max(lengths[0] // 2, 50), lengths[-1]
 
 
-def fine_tune(
-    family: RobotFamily, noises: Sequence[RobotNoise], folder: Path, minutes: float, told: Callable[[str], None]
-) -> SlamFineNet:
+def configuration(noises: Sequence[RobotNoise]) -> TrainingConfig:
+    """Training on runs with the errors and the lengths of these; ``fine_tune`` decides on how many, and how often."""
+    nodes = _lengths(noises)
+    return TrainingConfig(
+        family="slam", recipe="robots", nodes=nodes, validation_nodes=nodes, batch_graphs=8, learning_rate=5e-4,
+        weight_decay=0.0, edge_dropout=0.0, passes=2, robots=family_of(noises),
+    )  # fmt: skip
+
+
+def fine_tune(config: TrainingConfig, folder: Path, minutes: float, told: Callable[[str], None]) -> SlamFineNet:
     """The package's network after training on runs of a family.
 
     Args:
-        family: with the robot's errors.
-        noises: of its runs, whose lengths the simulated ones have.
+        config: with the robot's errors and lengths, from :func:`configuration`.
         folder: for the weights, their card and log.
         minutes: time for everything.
         told: gets a line on the progress.
@@ -121,18 +127,14 @@ def fine_tune(
         DrawingError: next to no run of the family can be learned from.
     """
     begun = time.monotonic()
-    nodes = _lengths(noises)
+    family, nodes = config.robots or RobotFamily(), config.nodes
     runs: list[SolvedRun] = []
     rng = np.random.default_rng(0)
     while len(runs) < _LEAST_RUNS or time.monotonic() - begun < _DRAWING * 60 * minutes:
         runs += draw_runs(family, 1, nodes, rng)
     told(f"{len(runs)} simulated runs of {nodes[0]}–{nodes[1]} keyframes")
     training, validation = [run for number, run in enumerate(runs) if number % _EVERY], runs[::_EVERY]
-    config = TrainingConfig(
-        family="slam", recipe="robots", nodes=nodes, graphs=len(training), validation_nodes=nodes,
-        validation_graphs=len(validation), batch_graphs=8, learning_rate=5e-4, weight_decay=0.0, edge_dropout=0.0,
-        passes=2, robots=family,
-    )  # fmt: skip
+    config = replace(config, graphs=len(training), validation_graphs=len(validation))
     task = SlamFineTask.on(config, training, validation)
     start = load_network(SlamFineNet)
     task.network.load_state_dict(start.state_dict())
