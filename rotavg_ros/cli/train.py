@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 
@@ -16,6 +15,7 @@ from rotavg_ros.results import make_folder
 from rotavg_ros.solver.networks import NETWORKS, WEIGHTS_FOLDER, CleanNet, PaperCleanNet, read_network
 from rotavg_ros.training.config import TrainingConfig, TrainingConfigError
 from rotavg_ros.training.paper_tasks import PaperCleanTask, PaperFineTask
+from rotavg_ros.training.run import Run
 from rotavg_ros.training.sfm_tasks import SfmCleanTask, SfmFineTask
 from rotavg_ros.training.slam_fine_tasks import SlamFineTask
 from rotavg_ros.training.slam_tasks import SlamCleanTask
@@ -138,42 +138,42 @@ def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Pa
     if config.family == "slam" and network == "fine-net":
         config = replace(config, edge_dropout=0.0)  # its runs are solved as they are; the card is to say so
     name = f"{config.family}-{network}"
-    # Errors in any of the files are noticed before the minutes that drawing graphs takes.
+    # Errors in any of the files, and what is in the folder, are noticed before the minutes that drawing graphs takes.
     weights = None if given.start is None else read_network(NETWORKS[name], given.start)
     make_folder(output)
     inputs: dict[str, str] = {}
-    task: TrainingTask
-    if config.family == "slam":
-        with working("simulating pose graphs"):
-            task = SlamCleanTask(config) if network == "clean-net" else SlamFineTask(config)
-    elif network == "clean-net":
-        with working("drawing view-graphs"):
-            make = PaperCleanTask if config.family == "paper" else SfmCleanTask
-            task = make(config, _torch_device(device))
-    elif config.family == "paper":
-        papers = _clean_net(PaperCleanNet, output, given.clean_net)
-        inputs["clean_net_fingerprint"] = fingerprint(papers)
-        with working("drawing view-graphs"):
-            task = PaperFineTask(config, _torch_device(device), papers)
-    else:
-        before = _clean_net(CleanNet, output, given.clean_net)
+    before: CleanNet | None = None
+    if network == "fine-net" and config.family != "slam":
+        before = _clean_net(PaperCleanNet if config.family == "paper" else CleanNet, output, given.clean_net)
         inputs["clean_net_fingerprint"] = fingerprint(before)
-        with working("drawing view-graphs"):
-            task = SfmFineTask(config, _torch_device(device), before)
     command = f"rotavg train {asked} {Path(given.config).stem if Path(given.config).exists() else given.config}"
     if given.clean_net is not None:
         command += " --clean-net WEIGHTS"
     if weights is not None:
         inputs["start_fingerprint"] = fingerprint(weights)
-        task.network.load_state_dict(weights.state_dict())
         command += " --start WEIGHTS"
+    Run(config, output, name, inputs, command).check()
+    task = _task(config, network, before, device)
+    if weights is not None:
+        task.network.load_state_dict(weights.state_dict())
     return Trainer(task, config, output, name, inputs, command)
 
 
-_Before = TypeVar("_Before", bound=CleanNet)
+def _task(config: TrainingConfig, network: str, before: CleanNet | None, device: str) -> TrainingTask:
+    """The task, with its graphs; ``before`` is the CleanNet of an SfM FineNet."""
+    if config.family == "slam":
+        with working("simulating pose graphs"):
+            return SlamCleanTask(config) if network == "clean-net" else SlamFineTask(config)
+    on = _torch_device(device)
+    with working("drawing view-graphs"):
+        if before is None:
+            return PaperCleanTask(config, on) if config.family == "paper" else SfmCleanTask(config, on)
+        if isinstance(before, PaperCleanNet):
+            return PaperFineTask(config, on, before)
+        return SfmFineTask(config, on, before)
 
 
-def _clean_net(kind: type[_Before], output: Path, given: Path | None) -> _Before:
+def _clean_net(kind: type[CleanNet], output: Path, given: Path | None) -> CleanNet:
     trained = output / f"{kind.NAME}.safetensors"
     path = given or (trained if trained.exists() else WEIGHTS_FOLDER / trained.name)
     return read_network(kind, path)

@@ -47,6 +47,15 @@ def save_checkpoint(
     save_tensors(path, tensors, {"identity": json.dumps(identity), "state": json.dumps(state)})
 
 
+def check_checkpoint(path: Path, identity: dict[str, Any]) -> None:
+    """Check that a checkpoint is one of the run of this identity.
+
+    Raises:
+        CheckpointError: not a checkpoint, or one of another run.
+    """
+    _read(path, identity)
+
+
 def load_checkpoint(
     path: Path,
     network: nn.Module,
@@ -59,18 +68,7 @@ def load_checkpoint(
     Raises:
         CheckpointError: not a checkpoint, or one of another run.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            about = file.metadata() or {}
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
-        saved_identity, state = json.loads(about["identity"]), json.loads(about["state"])
-    except (SafetensorError, OSError, KeyError, json.JSONDecodeError):
-        raise CheckpointError(f"{path}: not a checkpoint; remove the file to start anew") from None
-    changed = _differences(saved_identity, json.loads(json.dumps(identity)))
-    if changed:
-        raise CheckpointError(
-            f"{path}: of a run with another {', '.join(changed)}; choose another folder, or remove the file"
-        )
+    state, tensors = _read(path, identity)
     moments: dict[int, dict[str, Tensor]] = {}
     for key, value in tensors.items():
         if key.startswith(_OPTIMIZER):
@@ -85,8 +83,25 @@ def load_checkpoint(
             value.copy_(tensors[_AVERAGE + key])
     except (RuntimeError, ValueError, KeyError):
         raise CheckpointError(f"{path}: of another network; choose another folder, or remove the file") from None
-    assert isinstance(state, dict)
     return state
+
+
+def _read(path: Path, identity: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """State and tensors of a checkpoint of the run of this identity."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
+        saved_identity, state = json.loads(about["identity"]), json.loads(about["state"])
+    except (SafetensorError, OSError, KeyError, json.JSONDecodeError):
+        raise CheckpointError(f"{path}: not a checkpoint; remove the file to start anew") from None
+    changed = _differences(saved_identity, json.loads(json.dumps(identity)))
+    if changed:
+        raise CheckpointError(
+            f"{path}: of a run with another {', '.join(changed)}; choose another folder, or remove the file"
+        )
+    assert isinstance(state, dict)
+    return state, tensors
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, str]) -> None:

@@ -7,7 +7,7 @@ import json
 import math
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,18 +17,14 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from rotavg_ros.errors import UserError
 from rotavg_ros.results import commit, make_folder
 from rotavg_ros.solver.neurora.network_store import metadata
 from rotavg_ros.training.checkpoint import load_checkpoint, save_checkpoint, save_tensors, save_text
 from rotavg_ros.training.config import TrainingConfig
+from rotavg_ros.training.run import Run, TrainingError
 from rotavg_ros.version import __version__
 
 _MAX_GRADIENT_NORM = 1.0
-
-
-class TrainingError(UserError):
-    """A training run that cannot start or continue; the message says why."""
 
 
 class TrainingTask(Protocol):
@@ -59,21 +55,13 @@ class _State:
 
 
 class Trainer:
-    """Runs a task in a folder.
-
-    What it keeps there for a network called NAME:
-
-    - ``NAME.safetensors``, the weights of the best validation, and ``NAME.json``, their model card;
-    - ``NAME.checkpoint.safetensors``, from which a run continues exactly as if it had never stopped;
-    - ``NAME.log.jsonl``, a line per epoch.
+    """Runs a task in a folder, which then has the files of a :class:`Run`.
 
     Args:
         task: network and data.
         config: the run's configuration.
         folder: created if missing; a checkpoint there is resumed; one of another run is refused, and so are weights.
-        name: of the network, as in :data:`rotavg_ros.solver.networks.NETWORKS`.
-        inputs: other inputs that decide the outcome (fingerprints of other networks), for card and checkpoint.
-        command: the command that repeats the run, for the card.
+        name, inputs, command: as in :class:`Run`.
     """
 
     def __init__(
@@ -85,13 +73,10 @@ class Trainer:
         inputs: Mapping[str, str] | None = None,
         command: str = "",
     ) -> None:
-        self.task, self.config, self.name, self.command = task, config, name, command
-        self.inputs = dict(inputs or {})
+        self.task, self.config = task, config
+        self._run = Run(config, folder, name, dict(inputs or {}), command)
         make_folder(folder)
-        self.weights_path = folder / f"{name}.safetensors"
-        self.card_path = folder / f"{name}.json"
-        self._checkpoint_path = folder / f"{name}.checkpoint.safetensors"
-        self._log_path = folder / f"{name}.log.jsonl"
+        self._run.check()
         self.optimizer = torch.optim.Adam(
             task.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
@@ -99,16 +84,22 @@ class Trainer:
         parameters = dict(task.network.named_parameters()) if config.averaging > 0 else {}
         self._average = {key: value.detach().clone() for key, value in parameters.items()}
         self._state = _State()
-        if self._checkpoint_path.exists():
+        if self._run.checkpoint_path.exists():
             state = load_checkpoint(
-                self._checkpoint_path, task.network, self.optimizer, self._average, self._identity()
+                self._run.checkpoint_path, task.network, self.optimizer, self._average, self._run.identity()
             )
             self._state = _State(**state)
-            self._check_best()
-        else:
-            self._check_free()
         with self._writing():
             self._drop_log_after(self._state.epoch)
+
+    @property
+    def weights_path(self) -> Path:
+        """Of the best validation."""
+        return self._run.weights_path
+
+    def card(self) -> dict[str, Any]:
+        """The card of these weights."""
+        return self._run.card()
 
     @property
     def epochs_done(self) -> int:
@@ -129,7 +120,7 @@ class Trainer:
         figures: dict[str, float] = {}
         first = self._state.epoch
         # A bar only on a terminal; elsewhere the log shows the progress.
-        bar = tqdm(range(first, last), self.name, total=last, initial=first, unit="epoch", disable=None)
+        bar = tqdm(range(first, last), self._run.name, total=last, initial=first, unit="epoch", disable=None)
         for epoch in bar:
             start = time.perf_counter()
             losses = self._train(epoch)
@@ -147,11 +138,11 @@ class Trainer:
             with self._writing():
                 self._log(epoch, losses, figures)
                 save_checkpoint(
-                    self._checkpoint_path,
+                    self._run.checkpoint_path,
                     self.task.network,
                     self.optimizer,
                     self._average,
-                    self._identity(),
+                    self._run.identity(),
                     asdict(self._state),
                 )
             bar.set_postfix_str(" ".join(f"{key} {value:.4g}" for key, value in {**losses, **figures}.items()))
@@ -208,16 +199,9 @@ class Trainer:
             path = error.filename2 or error.filename or self.weights_path.parent
             raise TrainingError(f"{path}: cannot be written ({error.strerror}); mend that and run it again") from None
 
-    def _identity(self) -> dict[str, Any]:
-        return {**metadata(self.name), "config": self.config.to_dict(), **self.inputs}
-
-    def _origin(self) -> dict[str, Any]:
-        """What its card says of how to repeat the run."""
-        return {"network": self.name, "command": self.command, "config": self.config.to_dict(), **self.inputs}
-
     def _save_weights(self, figures: dict[str, float]) -> None:
         card = {
-            **self._origin(),
+            **self._run.origin(),
             "epoch": self._state.epoch,
             "hours": round(self._state.seconds / 3600, 3),
             "hardware": _hardware(self.task.network),
@@ -226,45 +210,19 @@ class Trainer:
             "torch": torch.__version__,
             "validation": {key: round(value, 5) for key, value in figures.items()},
         }
-        save_tensors(self.weights_path, self.task.network.state_dict(), metadata(self.name))
-        save_text(self.card_path, json.dumps(card, indent=2) + "\n")
+        save_tensors(self.weights_path, self.task.network.state_dict(), metadata(self._run.name))
+        save_text(self._run.card_path, json.dumps(card, indent=2) + "\n")
 
     def _log(self, epoch: int, losses: dict[str, float], figures: dict[str, float]) -> None:
         row = {"epoch": epoch, **losses, **{f"validation_{key}": value for key, value in figures.items()}}
-        with self._log_path.open("a") as log:
+        with self._run.log_path.open("a") as log:
             log.write(json.dumps(row) + "\n")
-
-    def card(self) -> dict[str, Any]:
-        """The card of the weights in its folder; empty if it is missing or damaged."""
-        with suppress(OSError, ValueError):
-            card = json.loads(self.card_path.read_text())
-            return card if isinstance(card, dict) else {}
-        return {}
-
-    def _check_best(self) -> None:
-        """Refuse a checkpoint without the best weights before it, which it does not hold itself."""
-        what = f"put it back, or remove {self._checkpoint_path.name}, which goes on from there, to start anew"
-        for path in (self.weights_path, self.card_path):
-            if not path.exists():
-                raise TrainingError(f"{path}: is missing; {what}")
-        if not {"epoch", "validation"} <= self.card().keys():
-            raise TrainingError(f"{self.card_path}: is damaged; {what}")
-
-    def _check_free(self) -> None:
-        """Refuse to begin beside weights of another run, which the first epoch would overwrite.
-
-        Weights of this run without a checkpoint are those of a first epoch that was killed while it was saved.
-        """
-        card = self.card()
-        if self.weights_path.exists() and any(card.get(key) != value for key, value in self._origin().items()):
-            what = "move it away or choose another folder"
-            raise TrainingError(f"{self.weights_path}: is of another run and would be overwritten; {what}")
 
     def _drop_log_after(self, epoch: int) -> None:
         """Remove the log lines of epochs that will be repeated."""
-        if self._log_path.exists():
-            lines = self._log_path.read_text(errors="replace").splitlines(keepends=True)
-            save_text(self._log_path, "".join(lines[:epoch]))
+        if self._run.log_path.exists():
+            lines = self._run.log_path.read_text(errors="replace").splitlines(keepends=True)
+            save_text(self._run.log_path, "".join(lines[:epoch]))
 
 
 def fingerprint(network: nn.Module) -> str:

@@ -14,6 +14,7 @@ from rotavg_ros.cli.train import load_config
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
 from rotavg_ros.solver.networks import NETWORKS, PaperCleanNet, read_network
 from rotavg_ros.solver.neurora.network_store import WEIGHTS_FOLDER, load_network
+from rotavg_ros.training import sfm_tasks
 from rotavg_ros.training.trainer import fingerprint
 
 CPU = ("--device", "cpu", "--threads", "1")
@@ -114,6 +115,24 @@ def test_the_network_that_a_training_starts_from_is_not_overwritten(
     assert main(command) == 2
     assert f"{start}: is of another run and would be overwritten" in capsys.readouterr().err
     assert start.read_bytes() == OTHER_WEIGHTS.read_bytes()
+
+
+def test_a_folder_of_another_run_is_refused_before_graphs_are_drawn(
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Drawing takes minutes."""
+    assert main(["train", "clean-net", str(config), *CPU, "--output", str(tmp_path)]) == 0
+
+    def never(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(sfm_tasks, "drawn_graphs", never)
+    config.write_text(TINY + "seed: 3\n")
+    assert main(["train", "clean-net", str(config), *CPU, "--output", str(tmp_path)]) == 2
+    assert "of a run with another seed" in capsys.readouterr().err
+    (tmp_path / "sfm-clean-net.checkpoint.safetensors").unlink()
+    assert main(["train", "clean-net", str(config), *CPU, "--output", str(tmp_path)]) == 2
+    assert "is of another run and would be overwritten" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -154,7 +154,7 @@ def test_best_weights_and_their_card_are_kept(tmp_path: Path) -> None:
     assert fingerprint(task.network) != best
     assert fingerprint(read_network(NETWORKS["sfm-clean-net"], trainer.weights_path)) == best
 
-    card = json.loads(trainer.card_path.read_text())
+    card = trainer.card()
     assert card["epoch"] == 2
     assert card["validation"] == {"objective": 1.0, "accuracy": 0.5}
     assert card["config"] == config.to_dict()
