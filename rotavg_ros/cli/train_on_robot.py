@@ -19,7 +19,10 @@ from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.results import make_folder
 from rotavg_ros.solver.learning.fine_tuning import SlamFineNet
 from rotavg_ros.solver.learning.robot_runs import RobotNoise, RobotRun
+from rotavg_ros.training.checkpoint import save_text
 from rotavg_ros.training.own_robot import LEAST_CLOSURES, Verdict, compare, configuration, fine_tune
+from rotavg_ros.training.run import writing
+from rotavg_ros.whole_file import replacing
 from rotavg_ros.wording import counted
 
 _TRIED = "tried"
@@ -55,18 +58,23 @@ def run(arguments: argparse.Namespace) -> int:
     config = configuration(noises)
     make_folder(tried)
     stated = {key: value for key, value in config.to_dict().items() if key not in _BY_TIME}
-    (tried / "robots.yaml").write_text(yaml.safe_dump(stated, sort_keys=False))
+    with writing(tried):
+        save_text(tried / "robots.yaml", yaml.safe_dump(stated, sort_keys=False))
     network = fine_tune(config, tried, arguments.minutes, lambda line: print(line, flush=True))
     with working("comparing on stretches that are held back"):
         verdict = compare(runs, network)
     print(_said(verdict))
+    with writing(arguments.output):
+        # The verdict comes first: without it no network is to be in use.
+        kept = {**asdict(verdict), "kept": verdict.is_better}
+        save_text(arguments.output / "verdict.json", json.dumps(kept) + "\n")
+        for suffix in (".json", ".safetensors") if verdict.is_better else ():
+            with replacing(arguments.output / f"{SlamFineNet.NAME}{suffix}") as temporary:
+                shutil.copyfile(tried / f"{SlamFineNet.NAME}{suffix}", temporary)
     if verdict.is_better:
-        for suffix in (".safetensors", ".json"):
-            shutil.copy(tried / f"{SlamFineNet.NAME}{suffix}", arguments.output)
         print(f"{arguments.output / SlamFineNet.NAME}.safetensors: use it by `--weights {arguments.output}`")
     else:
         print(f"the package's network stays; what was tried lies in {tried}")
-    (arguments.output / "verdict.json").write_text(json.dumps({**asdict(verdict), "kept": verdict.is_better}) + "\n")
     return 0
 
 

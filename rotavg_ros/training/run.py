@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,20 @@ from rotavg_ros.training.config import TrainingConfig
 
 class TrainingError(UserError):
     """A training run that cannot start or continue; the message says why."""
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """For a block that writes files into a folder; an older file that cannot be replaced stays as it is.
+
+    Raises:
+        TrainingError: one cannot be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        path = error.filename2 or error.filename or folder
+        raise TrainingError(f"{path}: cannot be written ({error.strerror}); mend that and run it again") from None
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from rotavg_ros.results import commit, make_folder
 from rotavg_ros.solver.neurora.network_store import metadata
 from rotavg_ros.training.checkpoint import load_checkpoint, save_checkpoint, save_tensors, save_text
 from rotavg_ros.training.config import TrainingConfig
-from rotavg_ros.training.run import Run, TrainingError
+from rotavg_ros.training.run import Run, TrainingError, writing
 from rotavg_ros.version import __version__
 
 _MAX_GRADIENT_NORM = 1.0
@@ -89,7 +89,7 @@ class Trainer:
                 self._run.checkpoint_path, task.network, self.optimizer, self._average, self._run.identity()
             )
             self._state = _State(**state)
-        with self._writing():
+        with writing(self._run.folder):
             self._drop_log_after(self._state.epoch)
 
     @property
@@ -124,7 +124,7 @@ class Trainer:
         for epoch in bar:
             start = time.perf_counter()
             losses = self._train(epoch)
-            with torch.no_grad(), self._averaged(), self._writing():
+            with torch.no_grad(), self._averaged(), writing(self._run.folder):
                 figures = self.task.validate()
                 if not math.isfinite(figures["objective"]):
                     raise TrainingError(_no_number("validation's objective", epoch))
@@ -135,7 +135,7 @@ class Trainer:
                 # The checkpoint comes last: a resumed run repeats everything that was interrupted before it.
                 if is_better:
                     self._save_weights(figures)
-            with self._writing():
+            with writing(self._run.folder):
                 self._log(epoch, losses, figures)
                 save_checkpoint(
                     self._run.checkpoint_path,
@@ -189,15 +189,6 @@ class Trainer:
         self.task.network.load_state_dict({**self.task.network.state_dict(), **self._average})
         yield
         self.task.network.load_state_dict({**self.task.network.state_dict(), **own})
-
-    @contextmanager
-    def _writing(self) -> Iterator[None]:
-        """For a block that writes files of the run; an older one that cannot be replaced stays as it is."""
-        try:
-            yield
-        except OSError as error:
-            path = error.filename2 or error.filename or self.weights_path.parent
-            raise TrainingError(f"{path}: cannot be written ({error.strerror}); mend that and run it again") from None
 
     def _save_weights(self, figures: dict[str, float]) -> None:
         card = {

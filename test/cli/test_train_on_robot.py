@@ -131,6 +131,25 @@ def test_an_output_that_is_taken_is_told_of_before_the_runs_are_solved(
     assert said == f"rotavg: error: {there}: is there from before; remove it or choose another --output\n"
 
 
+@pytest.mark.parametrize("taken", ["verdict.json", "slam-fine-net.json"])
+def test_a_folder_in_the_way_of_a_result(
+    taken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No network is left to be used then."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(own_robot, "_LEAST_RUNS", 4)
+    monkeypatch.setattr(Verdict, "is_better", True)
+    write_run(Path("run.g2o"), 1)
+    (Path("robot") / taken).mkdir(parents=True)
+    assert main(["train", "slam", "--from", "run.g2o", "--minutes", "0.01", "--output", "robot"]) == 2
+    error = capsys.readouterr().err
+    assert (
+        error.startswith(f"rotavg: error: {Path('robot', taken).resolve()}: cannot be written (")
+        and error.count("\n") == 1
+    )
+    assert not Path("robot/slam-fine-net.safetensors").exists()
+
+
 def test_the_family_has_what_runs_show() -> None:
     family = family_of([NOISE])
     assert family.planar_share == 1.0
