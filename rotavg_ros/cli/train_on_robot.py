@@ -20,7 +20,15 @@ from rotavg_ros.results import make_folder
 from rotavg_ros.solver.learning.fine_tuning import SlamFineNet
 from rotavg_ros.solver.learning.robot_runs import RobotNoise, RobotRun
 from rotavg_ros.training.checkpoint import save_text
-from rotavg_ros.training.own_robot import LEAST_CLOSURES, Verdict, compare, configuration, fine_tune
+from rotavg_ros.training.own_robot import (
+    LARGEST_CLOSURE_DEG,
+    LARGEST_STEP_DEG,
+    LEAST_CLOSURES,
+    Verdict,
+    compare,
+    configuration,
+    fine_tune,
+)
 from rotavg_ros.training.run import writing
 from rotavg_ros.whole_file import replacing
 from rotavg_ros.wording import counted
@@ -53,8 +61,10 @@ def run(arguments: argparse.Namespace) -> int:
             raise OwnRobotError(f"{path}: is there from before; remove it or choose another --output")
     runs = [_read(path, truth) for path, truth in zip(arguments.runs, truths, strict=True)]
     noises = [each.noise() for each in runs]
-    for path, noise in zip(arguments.runs, noises, strict=True):
+    for path, truth, noise in zip(arguments.runs, truths, noises, strict=True):
         print(f"{path}: {_told(noise)}", flush=True)
+        if truth is not None and (noise.odometry_deg > LARGEST_STEP_DEG or noise.closure_deg > LARGEST_CLOSURE_DEG):
+            raise OwnRobotError(f"{truth}: the errors above, by this truth, are too large for it to be that of {path}")
     config = configuration(noises)
     make_folder(tried)
     stated = {key: value for key, value in config.to_dict().items() if key not in _BY_TIME}

@@ -30,6 +30,8 @@ _EVEN = 0.15
 _DRAWING, _EVERY = 0.45, 8
 _LEAST_RUNS, _MOST_KEYFRAMES, _MOST_EPOCHS = 16, 800, 60
 _STANDARD_ERRORS = 2.0
+# Errors of a step and of a closure, degrees: none that is larger is simulated.
+LARGEST_STEP_DEG, LARGEST_CLOSURE_DEG = 20.0, 30.0
 # Least number of closures of a robot's run, and of a simulated one: these are shorter than a robot's long runs, so that
 # rare closures are denser in them.
 LEAST_CLOSURES = 12
@@ -77,8 +79,8 @@ def family_of(noises: Sequence[RobotNoise]) -> RobotFamily:
     return RobotFamily(
         worlds=tuple(world.value for world in worlds),
         planar_share=planar,
-        odometry_deg=around([noise.odometry_deg for noise in noises], 1e-3, 20.0),
-        closure_deg=around([noise.closure_deg for noise in noises], 1e-2, 30.0),
+        odometry_deg=around([noise.odometry_deg for noise in noises], 1e-3, LARGEST_STEP_DEG),
+        closure_deg=around([noise.closure_deg for noise in noises], 1e-2, LARGEST_CLOSURE_DEG),
         closures_per_keyframe=around(
             [noise.closures_per_keyframe for noise in noises], LEAST_CLOSURES / _lengths(noises)[0], 3.0
         ),

@@ -57,6 +57,12 @@ def write_run(path: Path, seed: int, closures: float = 0.4) -> DrawnGraph:
     return drawn
 
 
+def write_truth(path: Path, drawn: DrawnGraph) -> None:
+    quaternion = drawn.body_from_world * [-1, -1, -1, 1]  # files have world_from_body
+    rows = np.column_stack((np.arange(len(quaternion)), quaternion))
+    np.savetxt(path, rows, delimiter=",", header="id,qx,qy,qz,qw", comments="", fmt=["%d", *["%.17g"] * 4])
+
+
 @pytest.mark.parametrize("is_better", [True, False])
 def test_a_network_is_kept_only_if_it_is_better(
     is_better: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -65,10 +71,7 @@ def test_a_network_is_kept_only_if_it_is_better(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(own_robot, "_LEAST_RUNS", 4)
     monkeypatch.setattr(Verdict, "is_better", is_better)
-    drawn = write_run(Path("run.g2o"), 1)
-    quaternion = drawn.body_from_world * [-1, -1, -1, 1]  # files have world_from_body
-    rows = np.column_stack((np.arange(len(quaternion)), quaternion))
-    np.savetxt("truth.csv", rows, delimiter=",", header="id,qx,qy,qz,qw", comments="", fmt=["%d", *["%.17g"] * 4])
+    write_truth(Path("truth.csv"), write_run(Path("run.g2o"), 1))
     command = ["train", "slam", "--from", "run.g2o", "--truth", "truth.csv", "--minutes", "0.01", "--output", "robot"]
     assert main(command) == 0
     told = capsys.readouterr().out
@@ -148,6 +151,20 @@ def test_a_folder_in_the_way_of_a_result(
         and error.count("\n") == 1
     )
     assert not Path("robot/slam-fine-net.safetensors").exists()
+
+
+def test_the_truth_of_another_run_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As where two truths are given in another order than their runs; such errors would be simulated."""
+    monkeypatch.chdir(tmp_path)
+    drawn = [write_run(Path(f"{seed}.g2o"), seed) for seed in (1, 2)]
+    for number, truth in zip((2, 1), drawn, strict=True):
+        write_truth(Path(f"{number}.csv"), truth)
+    command = ["train", "slam", "--from", "1.g2o", "2.g2o", "--truth", "1.csv", "2.csv", "--minutes", "0.01"]
+    assert main([*command, "--output", "robot"]) == 2
+    assert capsys.readouterr().err.startswith("rotavg: error: 1.csv: the errors above, by this truth, are too large")
+    assert not Path("robot").exists()
 
 
 def test_the_family_has_what_runs_show() -> None:
