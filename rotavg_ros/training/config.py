@@ -16,6 +16,8 @@ from rotavg_ros.yaml_keys import repeated_keys
 
 # Number of seeds that torch tells apart.
 _SEEDS = 1 << 64
+# Cameras or keyframes of a graph. Of more cameras, a list of all pairs takes more than 10 GB.
+_NODES = 10, 20_000
 
 
 class TrainingConfigError(UserError):
@@ -84,8 +86,9 @@ class TrainingConfig:
                 raise TrainingConfigError(f"{name} is {getattr(self, name)}; it must be at least 1")
         for name in ("nodes", "validation_nodes"):
             low, high = getattr(self, name)
-            if not 10 <= low <= high:
-                raise TrainingConfigError(f"{name} is [{low}, {high}]; use an ascending pair of at least 10")
+            if not _NODES[0] <= low <= high <= _NODES[1]:
+                bounds = f"{_NODES[0]} to {_NODES[1]}"
+                raise TrainingConfigError(f"{name} is [{low}, {high}]; use an ascending pair of {bounds}")
         if self.robots is not None and self.recipe != "robots":
             raise TrainingConfigError("robots is for `family: slam` and `recipe: robots`; add these two lines")
         if self.warmup_epochs < 0:

@@ -170,6 +170,7 @@ def test_mistakes_take_one_line(
     [
         ("epochz: 3", "unknown key 'epochz'"),
         ("nodes: 3", "nodes is 3"),
+        ("nodes: [60, 2000000]", "nodes is [60, 2000000]; use an ascending pair of 10 to 20000"),
         ("- 1", "expected `key: value` lines"),
         ("family: cars", "family is 'cars'"),
         ("epochs: {", "not a readable YAML file"),
