@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from rotavg_ros.cli import train_on_robot
+from rotavg_ros.cli.main import print_warning
 from rotavg_ros.cli.progress import working
 from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.results import make_folder
@@ -23,6 +24,9 @@ from rotavg_ros.training.trainer import Trainer, TrainingTask, fingerprint
 
 # Largest numbers of FineNet's passes in a row, where the task has one.
 _MOST_PASSES = {"slam": 2, "paper": 1}
+# Share of the weights before the first step in their mean at the end. With a quarter (660 steps, averaging 0.998), the
+# error of a FineNet of SfM is twice as large as without averaging.
+_MOST_OF_FIRST = 0.02
 _CONFIGS = Path(__file__).parent.parent / "training" / "configs"
 
 
@@ -51,11 +55,23 @@ def run(arguments: argparse.Namespace) -> int:
     )
     if trainer.epochs_done:
         print(f"going on after epoch {trainer.epochs_done} of {config.epochs}", flush=True)
+    _warn_of_averaging(config, name)
     trainer.run()
     card = trainer.card()
     figures = ", ".join(f"{name} {value:.4g}" for name, value in card["validation"].items())
     print(f"{trainer.weights_path}: epoch {card['epoch']} of {config.epochs}, {figures}")
     return 0
+
+
+def _warn_of_averaging(config: TrainingConfig, name: str) -> None:
+    """Warn where the mean over the steps still has a good part of the weights before the first one at the end."""
+    steps = config.epochs * -(-config.graphs // config.batch_graphs)
+    share = config.averaging**steps
+    if share > _MOST_OF_FIRST:
+        print_warning(
+            f"{name}: with averaging {config.averaging:g}, {100 * share:.0f} % of what is kept after all {steps} steps "
+            "are the weights before the first; lower it, or train for more epochs or on more graphs"
+        )
 
 
 def _config_name(arguments: argparse.Namespace) -> str:

@@ -76,6 +76,24 @@ def test_the_card_of_robots_fine_net_states_no_dropout(tmp_path: Path) -> None:
         assert json.loads(card.read_text())["config"]["edge_dropout"] == 0
 
 
+def test_a_mean_over_more_steps_than_there_are_is_warned_of(
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is kept is then next to untrained."""
+    for averaging, warned in ((0.9, True), (0.2, False)):
+        config.write_text(f"{TINY}averaging: {averaging}\n")
+        assert main(["train", "clean-net", str(config), *CPU, "--output", str(tmp_path / str(averaging))]) == 0
+        said = f"{config}: with averaging 0.9, 66 % of what is kept after all 4 steps are the weights before the first;"
+        assert (said in capsys.readouterr().err) == warned
+
+
+def test_the_packages_trainings_are_long_enough_for_their_means() -> None:
+    for path in WEIGHTS_FOLDER.glob("*.json"):
+        config = json.loads(path.read_text())["config"]
+        steps = config["epochs"] * config["graphs"] / config["batch_graphs"]
+        assert config.get("averaging", 0.0) ** steps < 1e-3
+
+
 @pytest.mark.parametrize(
     ("network", "lines", "most"),
     [("slam-fine-net", "family: slam\nrecipe: robots\npasses: 3\n", 2), ("fine-net", "family: paper\npasses: 2\n", 1)],
