@@ -187,7 +187,17 @@ def test_simulated_runs_have_closures_to_learn_from_where_those_of_a_long_run_ar
     assert family_of([NOISE]).closures_per_keyframe == pytest.approx((0.4 / 1.5, 0.6))
 
 
+@pytest.mark.parametrize("stretches", [2, 3, 16])
+def test_a_network_that_is_no_better_is_seldom_kept(stretches: int) -> None:
+    """By two standard errors alone one in seven is, of two stretches."""
+    gains = np.random.default_rng(0).normal(size=(4000, stretches))
+    errors = gains.std(axis=1, ddof=1) / np.sqrt(stretches)
+    verdicts = [Verdict(gain, error, stretches, 0.0) for gain, error in zip(gains.mean(axis=1), errors, strict=True)]
+    assert np.mean([verdict.is_better for verdict in verdicts]) == pytest.approx(0.023, abs=0.007)
+
+
 def test_better_is_by_more_than_two_standard_errors() -> None:
     assert Verdict(0.1, 0.04, 10, 0.0).is_better
+    assert Verdict(0.1, 0.049, 1000, 0.0).is_better
     assert not Verdict(0.1, 0.06, 10, 0.0).is_better
     assert not Verdict(0.0, 0.0, 1, 0.0).is_better

@@ -10,7 +10,7 @@ never stopped. An SfM FineNet learns on what a CleanNet leaves, so train CleanNe
 
 `rotavg train slam --from GRAPH…` looks at how your robot errs in its own runs, simulates runs that err alike, and goes
 on training FineNet of robots' graphs on these. DIR gets the outcome only if it explains stretches of your runs that
-were held back better than before, by more than two standard errors. Once interrupted, it begins anew in another DIR.
+were held back better than before, by more than chance does (2.3 %). Once interrupted, it begins anew in another DIR.
 """
 
 from __future__ import annotations
