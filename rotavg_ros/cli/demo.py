@@ -29,6 +29,8 @@ from rotavg_ros.evaluation.live.played_run import LiveReport, PlayedRun, edge_is
 # Duration of the playback: slow enough for the node to work as it would live, short enough for a visitor.
 _PLAY_SECONDS = 12.0
 _MESSAGES_PER_SECOND = 1200.0
+# The node would wait for keyframes to which no odometry leads, as all of a photo collection are.
+_FROM_EDGES = {"keyframe_source": "edges", "unknown_keyframes": "create"}
 
 
 class DemoError(UserError):
@@ -137,7 +139,7 @@ def _own_graph(bag: Path, arguments: argparse.Namespace) -> _Scene:
         edge_is_false=edge_is_false(graph, truth, graph_file.position_gt),
     )
     description = f"{graph.num_nodes} keyframes, {int(is_closure.sum())} loop closures"
-    return _Scene(arguments.graph.name, description, run, is_closure, {"keyframe_source": "edges"})
+    return _Scene(arguments.graph.name, description, run, is_closure, _FROM_EDGES)
 
 
 def _topics(bag: Path) -> list[str]:

@@ -16,7 +16,9 @@ from rotavg_ros.cli.options.simulate import add_run_arguments
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``rotavg demo``."""
-    parser.add_argument("--graph", type=Path, metavar="FILE", help="your own graph (g2o, npz) instead of a simulation")
+    parser.add_argument(
+        "--graph", type=Path, metavar="FILE", help="your own graph, as for `rotavg solve`, instead of a simulation"
+    )
     parser.add_argument("--truth", type=Path, metavar="CSV", help="ground truth of --graph, as for `rotavg convert`")
     parser.add_argument("--stamps", type=Path, metavar="TXT", help="stamps of --graph, as for `rotavg convert`")
     parser.add_argument(

@@ -48,6 +48,15 @@ def test_somebodys_own_graph_without_truth(tmp_path: Path, start_process: Callab
     assert "no ground truth was given" in demo.output
 
 
+def test_a_graph_without_odometry(tmp_path: Path, start_process: Callable) -> None:
+    run = simulate_slam_graph(SlamSimulationConfig(num_keyframes=40), np.random.default_rng(0)).to_graph_file()
+    write_graph(tmp_path / "photos.txt", run)  # 1DSfM's format knows no odometry
+    output = tmp_path / "demo"
+    demo = start_process(*ROTAVG, "demo", "--graph", tmp_path / "photos.txt", "--output", output, "--rate", "60")
+    assert demo.wait(PATIENCE_S) == 0, demo.output
+    assert json.loads((output / "summary.json").read_text())["keyframes"] == 40
+
+
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
