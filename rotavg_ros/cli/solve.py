@@ -201,7 +201,10 @@ def summarize(
         "loop_closures": int(is_closure.sum()),
         "outliers": int(outlier.sum()),
         "flagged_closures": int((outlier & is_closure).sum()),
-        "warnings": list(with_names(solution.warnings, lambda row: int(graph_file.node_ids[row]))),
+        "warnings": [
+            *graph_file.warnings,
+            *with_names(solution.warnings, lambda row: int(graph_file.node_ids[row])),
+        ],
         "skipped": graph_file.skipped,
         "stage_seconds": solution.stage_seconds,
         "read_seconds": read_seconds,

@@ -121,6 +121,15 @@ def test_warnings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert json.loads((out / "summary.json").read_text())["warnings"] == []
 
 
+def test_what_the_file_makes_doubtful_is_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, out = tmp_path / "degrees.g2o", tmp_path / "out"
+    path.write_text("".join(f"EDGE_SE2 {i} {i + 1} 1 0 90 1 0 0 1 0 100\n" for i in range(4)))
+    assert main(["solve", str(path), "--output", str(out)]) == 0
+    (warning,) = json.loads((out / "summary.json").read_text())["warnings"]
+    assert "angles are in radians" in warning
+    assert capsys.readouterr().err == f"rotavg: warning: {path}: {warning}\n"
+
+
 def test_warnings_name_nodes_by_their_ids(tmp_path: Path) -> None:
     """Two odometries between nodes 5000, 5007 …, of which one slips by 57° in the step after node 5140."""
     rng, path = np.random.default_rng(0), tmp_path / "run.npz"

@@ -9,7 +9,7 @@ them, too) are closures whatever their ids, since odometry is never switched off
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,7 @@ from rotavg_ros.datasets.files.text_rows import (
 from rotavg_ros.datasets.planar import quaternion_of_heading
 from rotavg_ros.rotations import inverse
 from rotavg_ros.view_graph import MAX_TRANSLATION, EdgeKind
+from rotavg_ros.wording import counted
 
 # Where the entries of a planar information matrix, in the order xx xy xθ yy yθ θθ, are in the 21 of a spatial one.
 _PLANAR_ENTRIES = (0, 1, 5, 6, 10, 20)
@@ -121,7 +122,7 @@ def read(path: Path) -> GraphFile:
             raise GraphFileError.at(path, None, "every edge joins a pose with itself; there is nothing to solve")
     consecutive = joins_consecutive(every.ids[:, 0], every.ids[:, 1])
     planar = all(EDGE_TAGS[tag].planar for tag in edge_tags)
-    return GraphFile.from_ids(
+    graph_file = GraphFile.from_ids(
         every.ids[:, 0],
         every.ids[:, 1],
         inverse(torch.from_numpy(every.source_from_target)).numpy(),
@@ -134,6 +135,7 @@ def read(path: Path) -> GraphFile:
         information=None if planar else rotation_of(every.information),
         skipped=dict(skipped),
     )
+    return replace(graph_file, warnings=_doubts(every))
 
 
 @dataclass(frozen=True)
@@ -147,6 +149,7 @@ class _Edges:
     information: np.ndarray
     precision: np.ndarray
     has_switch: np.ndarray
+    beyond_turn: np.ndarray
 
     @classmethod
     def concatenate(cls, parts: list[_Edges]) -> _Edges:
@@ -156,6 +159,17 @@ class _Edges:
 
     def select(self, rows: np.ndarray) -> _Edges:
         return _Edges(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+
+def _doubts(edges: _Edges) -> tuple[str, ...]:
+    """Why the edges may not be what was meant: nobody measures more than a whole turn, but 30° read as rad are."""
+    lines = edges.line[edges.beyond_turn]
+    if not len(lines):
+        return ()
+    return (
+        f"{counted(len(lines), 'edge')} of {len(edges.line)} (the first in line {lines[0]}) with an angle of more than "
+        "a whole turn; angles are in radians: if these are degrees, convert them",
+    )
 
 
 def _unknown(tag: bytes) -> str:
@@ -188,7 +202,10 @@ def _parse_edges(path: Path, tag: EdgeTag, lines: list[int], rows: list[Row]) ->
         precision = information[:, 20] if tag.planar else information[:, ANGULAR_DIAGONAL].mean(axis=1)
     translation[without_position(translation, information)] = np.nan
     has_switch = np.full(len(rows), tag.switch > 0)
-    return _Edges(np.array(lines), ids, source_from_target, translation, information, precision, has_switch)
+    beyond_turn = (np.abs(rotation) > 2 * np.pi).any(axis=1)  # a quaternion's numbers never are
+    return _Edges(
+        np.array(lines), ids, source_from_target, translation, information, precision, has_switch, beyond_turn
+    )
 
 
 def _squared(root: np.ndarray) -> np.ndarray:
