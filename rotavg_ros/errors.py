@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,11 @@ def asking_about(path: Path, error: type[UserError]) -> Iterator[None]:
         raise error(f"{path}: {(problem.strerror or str(problem)).lower()}; check the path and its rights") from None
     except RuntimeError:  # raised by pathlib up to Python 3.12
         raise error(f"{path}: its symbolic links lead in a circle; check the path") from None
+
+
+def in_one_line(error: BaseException) -> str:
+    """What an error of rclpy says, in one line and without the places in its sources, of which users have none."""
+    return re.sub(r", at /\S+\.(?:c|cpp|h|hpp):\d+", "", " ".join(str(error).split()))
 
 
 def is_interruption(error: BaseException | None) -> bool:

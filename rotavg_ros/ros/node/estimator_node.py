@@ -14,7 +14,7 @@ from rclpy.duration import Duration
 from rclpy.executors import Executor
 from rclpy.timer import Timer
 
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, in_one_line
 from rotavg_ros.online import Discarded, OnlineEstimator
 from rotavg_ros.online.compaction import thinning
 from rotavg_ros.online.odometry.time_jumps import KEEPS_TIME_LINE
@@ -61,7 +61,7 @@ class RotavgNode(parameter_server.ParameterNode):
         try:
             super().__init__(NODE_NAME)
         except Exception as error:  # rclpy has a type of its own for each of its own parameters
-            raise UserError(" ".join(str(error).split())) from error
+            raise UserError(in_one_line(error)) from error
         parameter_server.refuse_repeated(self, sys.argv)
         self._settings = parameters = parameter_server.declare(self)
         self._solver = Solver(parameters, process)

@@ -9,7 +9,7 @@ import traceback
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, in_one_line
 from rotavg_ros.startup import loading
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ _LONGEST_WAIT_S = 0.1
 _PATIENCE_AT_EXIT_S = 1.0
 _LOG_PERIOD_S = 5.0
 
-USAGE = """usage: rotavg_node [--print-parameters] [--ros-args ...]
+USAGE = """usage: rotavg_node [--print-parameters] [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r __ns:=/NS] ...]
 
 Keeps a robot's orientations right: odometry and relative rotations in, absolute orientations and outlier flags out.
 --print-parameters writes all parameters with their defaults as a file for `--ros-args --params-file`."""
@@ -44,7 +44,7 @@ def main() -> int:
     except ModuleNotFoundError as error:
         return _fail_without(error)
     except Exception as error:  # rclpy has no common type for bad arguments and parameter files
-        return _fail(" ".join(str(error).split()))
+        return _fail(f"{in_one_line(error)}; see rotavg_node --help")
     try:
         return _run(stop, process)
     finally:

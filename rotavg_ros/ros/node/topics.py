@@ -12,7 +12,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, in_one_line
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -46,7 +46,7 @@ def user_error_about(topic: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # rclpy has a different type for every mistake
-        raise UserError(f"topic {topic}: {' '.join(str(error).split())}") from error
+        raise UserError(f"topic {topic}: {in_one_line(error)}") from error
 
 
 def publisher(node: Node, message_type: type, topic: str, qos: QoSProfile) -> Publisher:

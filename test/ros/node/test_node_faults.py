@@ -332,6 +332,21 @@ def test_a_mistake_at_the_start_is_one_line_and_exit_code_2(parameter: str, mess
     assert ended.stderr.startswith("rotavg_node: error: ") and ended.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-p", "gauge"], "'-p gauge'"),
+        (["--params-file", "nothing.yaml"], "nothing.yaml"),
+        (["-p", "odometry_topics:=['a topic']"], "topic a topic: "),
+    ],
+)
+def test_mistakes_that_rclpy_finds_name_no_place_in_its_sources(arguments: list[str], message: str) -> None:
+    ended = subprocess.run([NODE, "--ros-args", *arguments], capture_output=True, text=True, timeout=300, check=False)
+    assert (ended.returncode, ended.stderr.count("\n")) == (2, 1)
+    assert message in ended.stderr
+    assert "/src/" not in ended.stderr
+
+
 def test_a_parameter_file_speaks_to_the_node_in_its_namespace(tmp_path: Path) -> None:
     path = tmp_path / "fleet.yaml"
     path.write_text(to_yaml(NodeParameters(), "/fleet/a/rotavg").replace("gauge: ", "gauge: up # "))
