@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 import os
 import secrets
@@ -25,9 +26,11 @@ def replacing(path: Path) -> Iterator[Path]:
     Links to the file stay. It keeps its permissions; a new file gets the usual ones by the umask.
 
     Raises:
-        OSError: the place cannot be written.
+        OSError: the place cannot be written, or has what no file may take the place of.
     """
     place = real(path)
+    if place.exists() and not (place.is_file() or place.is_dir()):  # moving a file onto a folder fails by itself
+        raise FileExistsError(errno.EEXIST, "not a regular file (a pipe or a device); choose another")
     temporary = place.with_name(f".{place.name}.{secrets.token_hex(4)}{_TEMPORARY}")
     descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
     try:

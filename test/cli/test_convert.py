@@ -57,6 +57,20 @@ def test_a_pipe_is_no_graph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "pipe: is not a regular file (a pipe or a device); save the graph to one first" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("is_linked", [False, True])
+def test_no_file_takes_the_place_of_a_pipe(
+    graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], is_linked: bool
+) -> None:
+    pipe, output = tmp_path / "pipe.g2o", tmp_path / ("link.g2o" if is_linked else "pipe.g2o")
+    os.mkfifo(pipe)
+    if is_linked:
+        output.symlink_to(pipe)
+    assert main(["convert", str(graph_path), str(output), "--overwrite"]) == 2
+    said = f"rotavg: error: {output}: cannot be written: not a regular file (a pipe or a device); choose another\n"
+    assert capsys.readouterr().err == said
+    assert pipe.is_fifo()
+
+
 def test_refusals(graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "truth.csv").write_text("1.01, 0, 0, 0.5\n")
     (tmp_path / "folder.npz").mkdir()
