@@ -30,7 +30,6 @@ from rotavg_ros.datasets.files.text_rows import (
 from rotavg_ros.datasets.planar import quaternion_of_heading
 from rotavg_ros.rotations import inverse
 from rotavg_ros.view_graph import MAX_TRANSLATION, EdgeKind
-from rotavg_ros.wording import counted
 
 # Where the entries of a planar information matrix, in the order xx xy xθ yy yθ θθ, are in the 21 of a spatial one.
 _PLANAR_ENTRIES = (0, 1, 5, 6, 10, 20)
@@ -167,7 +166,7 @@ def _doubts(edges: _Edges) -> tuple[str, ...]:
     if not len(lines):
         return ()
     return (
-        f"{counted(len(lines), 'edge')} of {len(edges.line)} (the first in line {lines[0]}) with an angle of more than "
+        f"{len(lines)} of {len(edges.line)} edges (the first in line {lines[0]}) with an angle of more than "
         "a whole turn; angles are in radians: if these are degrees, convert them",
     )
 

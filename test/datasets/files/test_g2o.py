@@ -169,7 +169,7 @@ def test_cameras_with_gaps_between_their_ids_have_none(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("angle", "is_doubted"), [("30", True), ("-6.29", True), ("6.28", False)])
 def test_angles_that_may_be_degrees_are_warned_of(tmp_path: Path, angle: str, is_doubted: bool) -> None:
     text = f"# degrees?\nEDGE_SE2 0 1 1 0 0.1 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 {angle} 1 0 0 1 0 1\n"
-    said = ["1 edge of 2 (the first in line 3) with an angle of more than a whole turn"] if is_doubted else []
+    said = ["1 of 2 edges (the first in line 3) with an angle of more than a whole turn"] if is_doubted else []
     assert [warning.partition(";")[0] for warning in read_text(tmp_path, text).warnings] == said
 
 
