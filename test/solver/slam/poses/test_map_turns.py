@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +16,10 @@ from rotavg_ros.evaluation.common.cases import Case
 from rotavg_ros.evaluation.slam import pose_cases
 from rotavg_ros.solver.neurora.network_store import load_network
 from rotavg_ros.solver.slam.network import SlamCleanNet
+from rotavg_ros.solver.slam.poses.closures import Predictions
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.problem import PoseProblem
+from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.stages import bootstrap
@@ -151,3 +155,25 @@ def test_whichever_end_a_closure_is_written_from(case_and_pose: tuple[Case, Pose
         told = density > 1e-3
         assert told.any()
         assert np.median(np.abs(np.log(density_other[told] / density[told]))) < 0.2
+
+
+def test_turns_of_the_map_are_known_as_well_from_either_end(case_and_pose: tuple[Case, PoseMode]) -> None:
+    """What is predicted of a closure is as uncertain whichever end it is written from: only its sign differs."""
+    _, pose = case_and_pose
+    problem, position, count = pose.problem, pose.state.position, len(pose.problem.closures)
+    rng, size = np.random.default_rng(0), problem.turns + problem.shifts
+    mean, root = rng.normal(size=(count, size)), rng.normal(size=(count, size, size))
+    noise = np.tile(np.eye(problem.shifts), (count, 1, 1))
+    told, drawn = problem.told, problem.drawn
+    back: Any = SimpleNamespace(
+        mode=problem.mode,
+        bases=problem.bases,
+        drawn=SimpleNamespace(source=drawn.target, target=drawn.source),
+        told=replace(told, sign=-told.sign),
+    )
+    first, second = (
+        MapTurns.of(each, position, Predictions(sign * mean, root @ root.transpose(0, 2, 1)), noise, 0.1)
+        for each, sign in ((problem, 1.0), (back, -1.0))
+    )
+    for name in ("turn", "shift", "place", "covariance", "own"):
+        np.testing.assert_allclose(getattr(second, name), getattr(first, name), rtol=0, atol=1e-12)

@@ -59,18 +59,13 @@ class MapTurns:
         """
         closure, (turns, shifts), drawn = problem.mode.problem.closure, problem.bases, problem.drawn
         k, m = turns.shape[1], shifts.shape[1]
-        is_forward = problem.told.sign > 0
-        # A correction turns body_from_world; the map turns by its inverse.
-        turn = quaternion_rows.exp(-turns @ predictions.turn(problem.told.uneven).T)
-        shift = predictions.mean[:, k:] @ shifts.T
+        sign = problem.told.sign
+        # A correction turns body_from_world; the map turns by its inverse. An edge that is stated from the newer to the
+        # older end has the opposite residual, with the same covariance.
+        turn = quaternion_rows.exp(-sign * (turns @ predictions.turn(problem.told.uneven).T))
+        shift = sign[:, None] * (predictions.mean[:, k:] @ shifts.T)
         change = np.zeros((len(closure), k + m, k + m))
         change[:, :k, :k], change[:, k:, k:] = -problem.told.uneven, np.eye(m)
-        # If the newer end is the source: the inverse, F⁻¹. Translations are in the older end's frame in any case.
-        is_back = np.flatnonzero(~is_forward)
-        inverse = quaternion_rows.inverse(turn[:, is_back])
-        turn[:, is_back], shift[is_back] = inverse, -shift[is_back]
-        change[is_back, :k, :k] = turns.T @ quaternion_rows.matrices(inverse) @ turns @ problem.told.uneven[is_back]
-        change[is_back, k:, k:] *= -1
         noise = np.zeros_like(change)
         noise[:, :k, :k] = problem.told.rotation_variance[:, None, None] * np.eye(k)
         noise[:, k:, k:] = closure_covariance
@@ -80,7 +75,7 @@ class MapTurns:
         return cls(
             turn,
             shift,
-            position[np.where(is_forward, drawn.target[closure], drawn.source[closure])],
+            position[np.where(sign > 0, drawn.target[closure], drawn.source[closure])],
             change @ (predictions.covariance + noise) @ back_turned,
             change @ own @ back_turned,
             problem.bases,
