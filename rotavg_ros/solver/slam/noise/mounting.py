@@ -136,7 +136,7 @@ def between_axes(graph: ViewGraph) -> list[np.ndarray]:
         alone = graph.select_edges(torch.nonzero(edges).squeeze(1))
         if alone.num_edges == 0 or alone.rotation_components != 1:
             return []
-        turns = rotations.log(alone.target_from_source)
+        turns = rotations.log(alone.target_from_source[alone.tells_dimension])
         axes.append(torch.linalg.eigh(turns.T @ turns)[1][:, -1].numpy())
     pairs = np.outer(axes[1], axes[0])
     return _vectors(_nearest_rotation(np.stack((pairs, -pairs))))

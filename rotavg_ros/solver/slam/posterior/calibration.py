@@ -113,7 +113,7 @@ def _of_bias(
     closure_graph = prepared.closure_graph
     axes = np.eye(3)
     if is_planar:
-        turns = rotations.log(graph.target_from_source)
+        turns = rotations.log(graph.target_from_source[graph.tells_dimension])
         axes = torch.linalg.eigh(turns.T @ turns)[1][:, -1:].numpy().T
     elif axis is not None:
         axes = axis[None]

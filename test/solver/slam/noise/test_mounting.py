@@ -135,6 +135,16 @@ def test_between_two_axes_it_is_exact(vector: np.ndarray) -> None:
     assert min(apart) < 1e-5 < max(apart)
 
 
+def test_rejected_odometry_has_no_axis() -> None:
+    """A step beside the chain that a user has rejected, about any axis, does not tilt that of all others."""
+    seen = mounted(drawn("grid: 30 % random").graph, np.radians([30.0, 0.0, 0.0]))
+    more = seen.select_edges(torch.cat((torch.arange(seen.num_edges), seen.is_odometry.nonzero()[:3, 0])))
+    measured, label = more.target_from_source.clone(), more.label.clone()
+    measured[-3:], label[-3:] = rotations.exp(torch.tensor([2.0, 1.0, 1.0]).double()), EdgeLabel.REJECTED
+    found = between_axes(replace(more, target_from_source=measured, label=label))
+    np.testing.assert_allclose(found, between_axes(seen), rtol=0, atol=1e-6)
+
+
 VECTORS = {"little": np.radians([8.0, -9.0, 6.0]), "more": np.radians([10.0, 5.0, -25.0]), "camera": OPTICAL}
 # These two by default.
 ALWAYS = [("hills: 30 % random", "camera")]

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 
+from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.stress.kinds import KINDS
 from rotavg_ros.solver.slam.noise.calibration import Calibration
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
@@ -14,6 +18,7 @@ from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.objective import Evaluation
 from rotavg_ros.solver.slam.posterior.solve import Drawn
 from rotavg_ros.solver.slam.posterior.state import State
+from rotavg_ros.view_graph import EdgeLabel
 
 from .planar import GAUSSIAN_PRIORS, log_evidence, planar, problem_of, state_of
 
@@ -41,6 +46,16 @@ def test_a_bias_has_the_evidence_of_a_dense_integral(seed: int, planted_deg: flo
     np.testing.assert_allclose(totals, totals[-1], atol=0.02)
     # Forty steps of 1° tell it to 0.16°.
     assert abs(np.degrees(rate) - planted_deg) < 0.5
+
+
+def test_rejected_closures_do_not_tilt_a_bias_in_the_plane() -> None:
+    graph, _ = planar(0, 8, 0.0)
+    off_plane = rotations.exp(torch.tensor([1.5, -0.5, 1.0]).double())
+    measured, label = graph.target_from_source.clone(), graph.label.clone()
+    measured[-2:], label[-2:] = off_plane, EdgeLabel.REJECTED
+    problem = problem_of(replace(graph, target_from_source=measured, label=label), rate=0.01)
+    assert problem.components == 1 and problem.calibrated is not None
+    np.testing.assert_allclose(np.abs(problem.calibrated.axes[0, :3]), [0, 0, 1], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["hills: 30 % random", "sphere: 30 % random"])
