@@ -35,7 +35,7 @@ class CleanedClosures:
     """What is known of the E edges of a closure graph before the search.
 
     Attributes:
-        inlier_probability: ``(E,)``; 1 for odometry.
+        inlier_probability: ``(E,)``; 1 for odometry, unless a user has rejected it.
         network_log_odds: ``(E,)`` log-odds of being good, used in the posterior's prior; ±inf by label.
     """
 
@@ -93,12 +93,12 @@ def bootstrap(prepared: Prepared, cleaned: CleanedClosures) -> Tensor:
 
     A step of odometry costs its variance; a closure costs its own variance plus the squared error of a false one times
     its probability of being false. So the tree follows the odometry until its drift exceeds a trusted closure's error.
+    Odometry that a user has rejected costs what a false closure does.
     """
     graph, noise = prepared.closure_graph, prepared.noise
-    distrust = np.maximum(1 - cleaned.inlier_probability, _MIN_DISTRUST)
-    cost = np.where(
-        graph.is_odometry, graph.own_steps * noise.step_variance, noise.closure_variance + distrust * _FALSE_SQUARE
-    )
+    distrust = np.maximum(1 - cleaned.inlier_probability, np.where(graph.is_odometry, 0.0, _MIN_DISTRUST))
+    variance = np.where(graph.is_odometry, graph.own_steps * noise.step_variance, noise.closure_variance)
+    cost = variance + distrust * _FALSE_SQUARE
     closure_graph = ViewGraph.create(graph.source, graph.target, graph.residual, num_nodes=graph.num_nodes)
     forest = shortest_path_forest(closure_graph, torch.from_numpy(cost), root="first")
     return compose_orientations(forest, closure_graph)

@@ -12,12 +12,13 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 from torch import Tensor, nn
 
-from rotavg_ros import solve
+from rotavg_ros import rotations, solve
 from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver.slam.network import SlamCleanNet
-from rotavg_ros.solver.slam.posterior.solve import search
+from rotavg_ros.solver.slam.posterior.moves.starts import turned_parts
+from rotavg_ros.solver.slam.posterior.solve import Drawn, search
 from rotavg_ros.solver.slam.preparation import prepare
 from rotavg_ros.solver.slam.stages import bootstrap, clean
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
@@ -107,3 +108,30 @@ def test_a_robot_whose_closures_are_mostly_false_so_far_is_hardly_worse_off(shar
     alone, _ = solved(arrived & stamped.graph.is_odometry)
     assert error < uncertainty
     assert error < alone + 2.5
+
+
+def with_rejected_odometry(turned: list[float]) -> ViewGraph:
+    """A step in the middle of 60 keyframes, which a user has rejected, is off by a turn; closures lead across it."""
+    source, target, kind = slam_edges(60, 20, 0)
+    noise = small_noise(len(source), np.where(kind == 0, 0.2, 1.0), 1).as_rotvec()
+    step = int(np.flatnonzero((kind == 0) & (np.minimum(source, target) == 30))[0])
+    noise[step] = turned
+    label = np.zeros(len(source), dtype=np.int64)
+    label[step] = EdgeLabel.REJECTED
+    graph = measured(random_truth(60, 2), source, target, Rotation.from_rotvec(noise), kind=kind)
+    return replace(graph, label=torch.from_numpy(label))
+
+
+@pytest.mark.parametrize("turned", [[0.0, 0.0, 1.5], [0.05, 0.0, 0.1]])
+def test_rejected_odometry_has_no_part_in_any_start(turned: list[float]) -> None:
+    """Neither in the tree, which is the answer without a search, nor where parts of the map are turned."""
+    trees, parts = [], []
+    for each in (turned, [-0.3, 0.5, -0.8]):
+        drawn = Drawn.of(with_rejected_odometry(each), None)
+        tree = bootstrap(drawn.prepared, drawn.cleaned)
+        state = turned_parts(drawn.problem, drawn.prepared, tree)
+        trees.append(drawn.prepared.closure_graph.orientations(tree))
+        parts.append(drawn.orientations(state))
+    np.testing.assert_array_equal(*trees)
+    # A descent ends nearby, wherever it begins.
+    assert np.degrees(float(rotations.angle_between(*parts).max())) < 0.05

@@ -189,7 +189,7 @@ def _turned_parts(
     is_agreed = agree(pairs, model)
     for number, probability in enumerate(_ANNEALED_SLIPS):
         no_slip = no_slip_log_odds(graph.own_steps, problem.components, probability)
-        prior = np.where(graph.is_odometry, no_slip, model.prior_log_odds + problem.log_odds)
+        prior = np.where(graph.is_odometry, no_slip, model.prior_log_odds) + problem.log_odds
         cost = TruncatedCost.create(graph, model, prior)
         if number == 0 and anneal:
             correction = cost.anneal(correction)
