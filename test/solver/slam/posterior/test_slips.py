@@ -17,6 +17,9 @@ from rotavg_ros.evaluation.common.scoring import score_all
 from rotavg_ros.evaluation.slam import cases as slam_cases
 from rotavg_ros.evaluation.slam.contenders import ROSTER
 from rotavg_ros.metrics.orientations import orientation_errors
+from rotavg_ros.solver.slam.posterior.moves.slips import may_have_slipped, propose_slips
+from rotavg_ros.solver.slam.posterior.solve import search
+from rotavg_ros.solver.slam.stages import bootstrap
 from test.solver.graphs import as_quaternions, measured, random_truth, small_noise
 
 LAP, LAPS = 40, 4
@@ -48,6 +51,18 @@ def laps(
     kind = np.repeat([EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE], [num_nodes - 1, num_closures])
     graph = measured(truth, source, target, Rotation.from_rotvec(vector), kind=kind)
     return graph, truth, is_false, np.isin(np.arange(len(source)), list(slips))
+
+
+@torch.no_grad()
+def test_closures_that_a_user_has_rejected_tell_of_no_slip() -> None:
+    """All that lead across a slip agree about it, but none may become good by it."""
+    graph, *_ = laps(True, 0.0, num_laps=3, slips={60: 50.0})
+    lower, higher = torch.minimum(graph.source, graph.target), torch.maximum(graph.source, graph.target)
+    leads_across = ~graph.is_odometry & (lower <= 60) & (higher > 60)
+    label = torch.where(leads_across, int(EdgeLabel.REJECTED), int(EdgeLabel.AUTOMATIC))
+    mode = search(replace(graph, label=label), None, bootstrap).modes[0]
+    assert int(mode.is_false.sum()) == int(leads_across.sum()) > 50
+    assert not list(propose_slips(mode)) and not may_have_slipped(mode)
 
 
 @pytest.mark.parametrize(

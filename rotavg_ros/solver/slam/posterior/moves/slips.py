@@ -40,6 +40,7 @@ class Witnesses:
     Attributes:
         turned: ``(4, C)`` residuals of the closures, from older to newer end.
         can_tell: ``(C,)`` bool, whether one chain of odometry has both ends.
+        may_be_good: ``(C,)`` bool, those of them that are false and that no user has rejected.
         first, last: ``(C,)`` segments that each closure spans: first ≤ s < last.
         gain: ``(C,)`` nats that each closure gains by being good, relative to being false on its own.
         segment: ``(S,)`` edges.
@@ -48,6 +49,7 @@ class Witnesses:
 
     turned: np.ndarray
     can_tell: np.ndarray
+    may_be_good: np.ndarray
     first: np.ndarray
     last: np.ndarray
     gain: np.ndarray
@@ -60,6 +62,7 @@ class Witnesses:
         turned = quaternion_rows.residual(state.correction, problem.measured, graph.source, graph.target)[:, closure]
         turned = np.where(problem.sign > 0, turned, quaternion_rows.inverse(turned))
         can_tell = graph.chain[graph.source[closure]] == graph.chain[graph.target[closure]]
+        may_be_good = can_tell & mode.is_false & np.isfinite(problem.log_odds[closure])
         segment = np.flatnonzero(state.is_good[: graph.num_segments])
         start = graph.span[0, segment]
         order = np.argsort(start, kind="stable")
@@ -68,13 +71,13 @@ class Witnesses:
         alone = log_false(square, problem.components, problem.priors)
         gain = np.maximum(mode.left_out.if_good[closure] - alone, 0.0)
         segment = segment[order]
-        return cls(turned, can_tell, first, last, gain, segment, mode.left_out.log_odds[segment])
+        return cls(turned, can_tell, may_be_good, first, last, gain, segment, mode.left_out.log_odds[segment])
 
     def agreeing(self, turn: np.ndarray, mode: Mode) -> np.ndarray:
         """``(C,)`` bool, false closures whose error is about ``turn`` ``(4,)``."""
         tolerance = 2 * AGREE**2 * mode.problem.components * mode.state.noise.closure_variance + AGREE_ANGLE**2
         difference = 2 * np.arccos(np.minimum(np.abs(turn @ self.turned), 1.0))
-        return np.asarray((difference**2 < tolerance) & self.can_tell & mode.is_false)
+        return np.asarray((difference**2 < tolerance) & self.may_be_good)
 
     def best_place(self, agrees: np.ndarray, disagrees: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
         """Index of the segment where a slip gains most; ``(C,)`` bool, closures it makes good, and ones it makes false.
@@ -126,7 +129,7 @@ def _places(mode: Mode, witnesses: Witnesses) -> list[tuple[float, int, int, np.
         For each: gain in nats, each closure counted independently; the closure whose residual is the turn; index of the
         segment; ``(C,)`` bool, closures it makes good, and those it makes false.
     """
-    left, found = witnesses.can_tell & mode.is_false, []
+    left, found = witnesses.may_be_good.copy(), []
     disagrees = witnesses.can_tell & ~mode.is_false
     for closure in np.flatnonzero(left if len(witnesses.segment) else np.zeros_like(left)):
         if left[closure]:

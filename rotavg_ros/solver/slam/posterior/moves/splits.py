@@ -74,7 +74,7 @@ def propose_splits(mode: Mode) -> Iterator[Proposal]:
 
 def _groups(mode: Mode, witnesses: Witnesses) -> Iterator[_Group]:
     """Groups of at least two false closures that one turn or its inverse explains."""
-    left = witnesses.can_tell & mode.is_false
+    left = witnesses.may_be_good.copy()
     for number in np.flatnonzero(left):
         if left[number]:
             turn = witnesses.turned[:, [number]]
