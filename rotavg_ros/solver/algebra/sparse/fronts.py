@@ -120,10 +120,13 @@ def eliminate(shape: Shape, first: int, last: int, room: Room, top: int) -> int:
             end = min(begin + 4, num_pivots)
             for k in range(begin, end):
                 _take(own[k, k:], own, k, begin, k)
-                pivot = max(own[k, k], _ROUNDING * scale[k])
-                if not pivot > 0.0:
+                least = _ROUNDING * scale[k]
+                if own[k, k] < least:
+                    # What is left beside it is rounding, too; divided by so small a root it would grow.
+                    own[k, k], own[k, k + 1 :] = least, 0.0
+                if not own[k, k] > 0.0:
                     return -1
-                root = np.sqrt(pivot)
+                root = np.sqrt(own[k, k])
                 own[k, k] = root
                 for i in range(k + 1, width):
                     own[k, i] /= root

@@ -187,6 +187,21 @@ def test_a_large_part_that_nothing_holds_is_lifted_as_well(scale: float) -> None
         assert np.isfinite(solved).all()
 
 
+def test_what_rounding_leaves_of_many_pivots_does_not_grow() -> None:
+    """Of a matrix of a third of its full rank: what is left beside a pivot is rounding as well as the pivot."""
+    blocks, size = 8, 6
+    first, second = np.triu_indices(blocks, 1)
+    elimination = _elimination(first, second, blocks, size, is_dense=False)
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        root = np.exp(4 * rng.normal(size=(blocks * size, 1))) * rng.normal(size=(blocks * size, blocks * size // 3))
+        matrix = (root @ root.T).reshape(blocks, size, blocks, size)
+        known = rng.normal(size=(blocks * size // 3, 1))
+        solved = _solved(elimination, matrix, (root @ known).reshape(blocks, size, 1))
+        # One of the solutions, as far as the scales of its equations let tell.
+        np.testing.assert_allclose(root.T @ solved.reshape(-1, 1), known, rtol=0, atol=0.01)
+
+
 @pytest.mark.parametrize("value", [-1.0, np.nan])
 def test_what_is_not_positive_definite_is_refused(value: float) -> None:
     elimination = Elimination(np.array([0]), np.array([1]), 2, 1)

@@ -71,3 +71,32 @@ def test_random_joins_are_as_likely_wherever_a_robot_lies() -> None:
         costs.append(Rival(mode, estimate_poses(problem, hold=True, start=start)).cost)
     # What is left is what they repeat of each other by chance. By normal densities about the map it was 18.
     assert np.std(costs) < 10.0
+
+
+@pytest.mark.parametrize("seed", [8, 10])
+def test_two_robots_of_exact_odometry_that_random_closures_join_have_an_answer(seed: int) -> None:
+    """Steps and links over two steps that agree exactly are as stiff as priors allow, and hardly anything joins them.
+
+    One such drawing in seven had ended in an exception.
+    """
+    rng = np.random.default_rng(seed)
+    edges: list[tuple[int, int, EdgeKind, Rotation, np.ndarray]] = []
+    for first, count in ((0, 6), (6, 18)):
+        turns, places = [Rotation.from_rotvec([0, 0, rng.normal()])], [rng.normal(size=3)]
+        for _ in range(count - 1):
+            places.append(places[-1] + turns[-1].apply([0.4, 0, 0]))
+            turns.append(turns[-1] * Rotation.from_rotvec(0.15 * rng.normal(size=3)))
+        steps = [(i, i + 1) for i in range(count - 1)]
+        for i, j in steps + [(i, i + 2) for i in range(count - 2) if rng.random() < 0.5]:
+            back = turns[i].inv()
+            edges.append((first + i, first + j, EdgeKind.ODOMETRY, back * turns[j], back.apply(places[j] - places[i])))
+    for _ in range(5):
+        ends = int(rng.integers(0, 6)), 6 + int(rng.integers(0, 18))
+        wrong = Rotation.random(random_state=int(rng.integers(1 << 30)))
+        edges.append((*ends, EdgeKind.LOOP_CLOSURE, wrong, 4 * rng.normal(size=3)))
+    source, target, kind, turned, moved = zip(*edges, strict=True)
+    stated = np.array([each.as_quat() for each in turned])
+    graph = ViewGraph.create(source, target, source_from_target=stated, kind=kind, translation=np.array(moved))
+    solution = solve(graph)
+    assert solution.position is not None and solution.position.isfinite().all()
+    assert solution.uncertainty.isfinite().all()
