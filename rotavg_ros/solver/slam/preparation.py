@@ -62,7 +62,7 @@ class Prepared:
 
 
 def prepare(graph: ViewGraph) -> Prepared:
-    """Contract the odometry chains and estimate the noise of steps and closures. Rejected edges take no part.
+    """Contract the odometry chains, along rejected edges only where nothing else connects, and estimate the noise.
 
     If most closures disagree with the odometry, a constant bias may be the cause; it is removed if fewer then disagree.
     """
@@ -125,7 +125,7 @@ def made_of_odometry(graph: ViewGraph) -> np.ndarray:
 
 
 def contract_odometry(graph: ViewGraph, restated: np.ndarray | None = None) -> tuple[ClosureGraph, SpanningForest]:
-    """The closure graph, and the forest along which it was contracted; rejected edges take no part.
+    """The closure graph, and the forest along which it was contracted, over rejected edges only if nothing else joins.
 
     Args:
         graph: the graph.

@@ -28,8 +28,8 @@ _OTHERWISE = 0.5
 _DIMENSIONS = 3
 # A closure counts as predicted if the variance is less than this share of the uninformed one.
 _TOLD = 0.5
-# Variance of the normal density whose value at zero is the mean of another one over its own values, in units of that
-# one's variance: shifts of which nothing is known are as likely wherever they lead.
+# Variance of the normal density whose value at zero is the geometric mean of another one over its own values, in units
+# of that one's variance: shifts of which nothing is known are as likely wherever they lead.
 ANYWHERE = np.e
 
 

@@ -100,8 +100,8 @@ class Said:
     def log_anywhere(self) -> np.ndarray:
         """``(C,)`` nats, log densities of shifts that lead anywhere on the map.
 
-        The mean of a normal density over its own values, wherever the ends lie. Itself it would draw together what
-        false closures join at random, since all of these are shorter then.
+        The geometric mean of a normal density over its own values, wherever the ends lie. Itself it would draw together
+        what false closures join at random, since all of these are shorter then.
         """
         components = self.anywhere[0].shape[1]
         return np.asarray(-(np.log(2 * np.pi * self.scale.anywhere) + 1) * components / 2)
