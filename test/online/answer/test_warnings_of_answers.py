@@ -14,7 +14,7 @@ LAP, STEPS, SLIP, FIRST_ID = 30, 150, 62, 5000
 
 
 def test_a_slip_is_between_keyframes_that_can_be_looked_up() -> None:
-    """Two robots of five rounds each: the second one's odometry is off by a radian once, which its closures tell."""
+    """Two robots of five rounds each: the second one's odometry is off by a radian once, which closures over one round, two and three tell."""
     turn = 2 * np.pi / LAP
     estimator = OnlineEstimator(EstimatorOptions(keyframe_source="edges"))
     rng = np.random.default_rng(0)
@@ -27,8 +27,9 @@ def test_a_slip_is_between_keyframes_that_can_be_looked_up() -> None:
     for robot, slip in (("a", 0.0), ("b", 1.0)):
         for i in range(STEPS):
             add(robot, i, i + 1, turn + slip * (i == SLIP), EdgeKind.ODOMETRY)
-        for i in range(0, STEPS - LAP, 2):
-            add(robot, i, i + LAP, 0.0, EdgeKind.LOOP_CLOSURE)
+        for laps in (1, 2, 3):
+            for i in range(0, STEPS - laps * LAP, 2):
+                add(robot, i, i + laps * LAP, 0.0, EdgeKind.LOOP_CLOSURE)
     answer = estimator.tick(force_cold=True)
     assert answer is not None
     (warning,) = (text for text in answer.warnings if "slipped" in text)
