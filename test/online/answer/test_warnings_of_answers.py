@@ -14,7 +14,7 @@ LAP, STEPS, SLIP, FIRST_ID = 30, 150, 62, 5000
 
 
 def test_a_slip_is_between_keyframes_that_can_be_looked_up() -> None:
-    """Two robots of five rounds each: the second one's odometry is off by a radian once, which closures over one round, two and three tell."""
+    """Two robots of five rounds: the second is off by a radian once, as closures over one round, two and three tell."""
     turn = 2 * np.pi / LAP
     estimator = OnlineEstimator(EstimatorOptions(keyframe_source="edges"))
     rng = np.random.default_rng(0)
