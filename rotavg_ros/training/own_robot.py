@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy.special import ndtr, stdtrit
 
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily
 from rotavg_ros.datasets.simulation.trajectories import PLANAR_WORLDS
@@ -64,7 +63,7 @@ class Verdict:
         """
         if self.stretches < 2:
             return False
-        needed = float(student.isf(norm.sf(_STANDARD_ERRORS), self.stretches - 1))
+        needed = float(stdtrit(self.stretches - 1, ndtr(_STANDARD_ERRORS)))
         return self.gain > needed * self.standard_error
 
 
