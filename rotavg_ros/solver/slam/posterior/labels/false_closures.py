@@ -151,42 +151,50 @@ def _log_sums(
 ) -> np.ndarray:
     """Logarithms of the products in :meth:`FalseDensity.log_sums`, taken whenever a product gets small."""
     of_run, before, of_any = shares
-    ways, inner = len(of_run) * len(before), len(of_any) * len(alone) * density.shape[1]
+    kinds, kernels = len(alone), density.shape[1]
+    ways, inner = len(of_run) * len(before), len(of_any) * kinds * kernels
     size = ways * inner
     # Products for the current run; then for all runs, with shared c and d and with their own.
     product, total = np.ones(size), np.zeros(size)
+    at_rates = product.reshape(len(of_run), len(before), len(of_any), kinds, kernels)
     products, totals = np.ones(size + inner), np.zeros(size + inner)
+    its, recent, others = np.empty(kernels), np.empty(kernels), np.empty(kernels)
     for place in range(len(order)):
         n = order[place]
-        at = 0
-        for c in of_run:
-            for d in before:
-                for g in of_any:
-                    of_its = c if has_any[0, n] else 0.0
-                    near = (1 - of_its) * (d if has_any[1, n] else 0.0)
-                    rest = 1 - of_its - near
-                    far = rest * (g if has_any[2, n] else 0.0)
-                    for m in range(len(alone)):
-                        by_itself = (rest - far) * alone[m, n]
-                        for s in range(density.shape[1]):
-                            each = by_itself + far * density[2, s, n] + near * density[1, s, n]
-                            product[at] *= max(each + of_its * density[0, s, n], _LEAST)
-                            if not _SMALL < product[at] < _LARGE:
-                                total[at] += math.log(product[at])
-                                product[at] = 1.0
-                            at += 1
+        for s in range(kernels):
+            its[s], recent[s], others[s] = density[0, s, n], density[1, s, n], density[2, s, n]
+        is_out = False
+        for c in range(len(of_run)):
+            for d in range(len(before)):
+                of_its = of_run[c] if has_any[0, n] else 0.0
+                near = (1 - of_its) * (before[d] if has_any[1, n] else 0.0)
+                rest = 1 - of_its - near
+                for g in range(len(of_any)):
+                    far = rest * (of_any[g] if has_any[2, n] else 0.0)
+                    for m in range(kinds):
+                        by_itself, row = (rest - far) * alone[m, n], at_rates[c, d, g, m]
+                        # Without a branch several kernels are multiplied at once.
+                        for s in range(kernels):
+                            each = by_itself + far * others[s] + near * recent[s] + of_its * its[s]
+                            row[s] *= max(each, _LEAST)
+                            is_out |= not _SMALL < row[s] < _LARGE
+        if is_out:
+            _take_logarithms(product, total)
         if place + 1 < len(order) and run[order[place + 1]] == run[n]:
             continue
         _count_run(product, total, products, totals)
-        for at in range(size):
-            product[at], total[at] = 1.0, 0.0
-        for at in range(size + inner):
-            if not _SMALL < products[at] < _LARGE:
-                totals[at] += math.log(products[at])
-                products[at] = 1.0
-    for at in range(size + inner):
-        totals[at] += math.log(products[at])
-    return totals
+        product[:], total[:] = 1.0, 0.0
+        _take_logarithms(products, totals)
+    return np.asarray(totals + np.log(products))
+
+
+@compiled
+def _take_logarithms(product: np.ndarray, total: np.ndarray) -> None:
+    """Move products ``(n,)`` that are about to leave the range of numbers into their logarithms' sums."""
+    for at in range(len(product)):
+        if not _SMALL < product[at] < _LARGE:
+            total[at] += math.log(product[at])
+            product[at] = 1.0
 
 
 @compiled
