@@ -11,7 +11,7 @@ from rotavg_ros.evaluation.common.score_tables import VERDICT_FIGURES, Figure, p
 from rotavg_ros.evaluation.common.scoring import Scores, geometric_mean
 from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS
-from rotavg_ros.evaluation.slam.pose_cases import AS_RECORDED
+from rotavg_ros.evaluation.slam.pose_cases import AS_RECORDED, RECORDED_NOISE
 from rotavg_ros.evaluation.slam.pose_contenders import PEERS, ROWS, TOLD
 
 _METRES, _DEGREES = "floored_m", "floored_deg"
@@ -167,10 +167,16 @@ def _recorded(scores: Scores) -> Table:
     ]
     headings = ("ATE m", ".2f"), ("mean °", ".2f"), ("precision", ".3f"), ("recall", ".3f"), ("CPU s", ".2f")
     columns = (Column("graph"), Column("method"), *(Column(heading, form) for heading, form in headings))
+    left = (
+        f"{name} {noise.step_deg:g}° and {noise.step_m:g} m a step, {noise.closure_deg:g}° and {noise.closure_m:g} m a "
+        "good closure"
+        for name, noise in RECORDED_NOISE.items()
+        if name in scores.names
+    )
     note = (
         "Real closures against ground truth. For true deviations stand those that edges leave against it: "
-        "0.13° and 0.025 m a step, 1.8° and 0.18 m a good closure. The oracle uses the closures that ground truth "
-        "knows to be good; where it knows few, others may be better."
+        f"{'; '.join(left)}. The oracle uses the closures that ground truth knows to be good; where it does not know "
+        "some that matter, others are better."
     )
     return Table("B25b as recorded", columns, tuple(rows), (note,))
 

@@ -11,6 +11,7 @@ import torch
 from evo.core.metrics import APE, PoseRelation
 from evo.core.trajectory import PosePath3D
 
+from rotavg_ros import rotations
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.answers import Answer
 from rotavg_ros.evaluation.common.cases import Case, drawings
@@ -149,6 +150,33 @@ def test_a_recorded_graph(shared_data: Path) -> None:
     assert int(case.is_good.sum()) > 80
     assert case.poses.stated.shape == (case.graph.num_edges, 2)
     assert bool(torch.isfinite(case.poses.stated).all())
+
+
+@pytest.mark.parametrize("name", pose_cases.RECORDED_NOISE)
+def test_true_deviations_are_what_the_edges_of_a_recorded_graph_leave(shared_data: Path, name: str) -> None:
+    case = next(drawings(pose_cases.kinds(lambda: shared_data, [name]), [0]))
+    noise, good = pose_cases.RECORDED_NOISE[name], case.is_good
+    assert float(case.noise[good].square().mean().sqrt()) == pytest.approx(np.radians(noise.closure_deg), rel=0.03)
+    assert float((case.place_error[good].square().mean() / 2).sqrt()) == pytest.approx(noise.closure_m, rel=0.03)
+    # Sums over 100 steps, in the world frame, in which the truth's own errors of the poses between cancel.
+    turn, shift = residuals_of_steps(case)
+    sums = [np.convolve(each, np.ones(100), mode="valid") / 10 for each in (turn, *shift.T)]
+    known = np.isfinite(sums[0])
+    turned, *shifted = (np.sqrt((each[known] ** 2).mean()) for each in sums)
+    assert turned == pytest.approx(np.radians(noise.step_deg), rel=0.03)
+    assert np.hypot(*shifted) / np.sqrt(2) == pytest.approx(noise.step_m, rel=0.03)
+
+
+def residuals_of_steps(case: Case) -> tuple[np.ndarray, np.ndarray]:
+    """``(N - 1,)`` rad and ``(N - 1, 2)`` metres of a planar chain of odometry, NaN where the truth is unknown."""
+    graph, poses = case.graph.select_edges(case.graph.is_odometry), case.poses
+    assert poses is not None and graph.translation is not None
+    assert torch.equal(graph.source, torch.arange(graph.num_nodes - 1)) and torch.equal(graph.target, graph.source + 1)
+    source, target = case.truth[graph.source], case.truth[graph.target]
+    turn = rotations.multiply(rotations.inverse(target), rotations.multiply(graph.target_from_source, source))
+    moved = poses.position[graph.target] - poses.position[graph.source]
+    shift = moved - rotations.rotate(rotations.inverse(source), graph.translation)
+    return rotations.log(turn)[:, 2].numpy(), shift[:, :2].numpy()
 
 
 def test_a_classic_graph_is_drawn_anew(shared_data: Path) -> None:

@@ -66,3 +66,11 @@ def test_report(tmp_path: Path) -> None:
 def test_a_report_of_nothing(tmp_path: Path) -> None:
     """Interrupted before the first case was done."""
     assert pose_report.report(tmp_path, Scores(), "rotavg").exists()
+
+
+def test_the_note_on_recorded_graphs_tells_what_each_was_told(tmp_path: Path) -> None:
+    row = Score(
+        CaseKey("B25b_0.250", "as recorded"), "neurora", 1.0, 1.0, 1.0, OutlierCounts(1, 0, 0, 1), 1.0, 0, 0.5, 1.0, 1.0
+    )
+    text = pose_report.report(tmp_path, Scores([row]), "rotavg").read_text(encoding="utf-8")
+    assert "leave against it: B25b_0.250 0.18° and 0.015 m a step, 2.3° and 0.29 m a good closure. The oracle" in text
