@@ -32,6 +32,10 @@ class OutlierCounts:
         return OutlierCounts(*(ours + theirs for ours, theirs in zip(astuple(self), astuple(other), strict=True)))
 
     @property
+    def num_outliers(self) -> int:
+        return self.true_positives + self.false_negatives
+
+    @property
     def precision(self) -> float:
         """Share of the flagged edges that are outliers; 1 if none is flagged."""
         flagged = self.true_positives + self.false_positives
@@ -40,8 +44,7 @@ class OutlierCounts:
     @property
     def recall(self) -> float:
         """Share of the outliers that are flagged; 1 if there is none."""
-        outliers = self.true_positives + self.false_negatives
-        return self.true_positives / outliers if outliers else 1.0
+        return self.true_positives / self.num_outliers if self.num_outliers else 1.0
 
     @property
     def accuracy(self) -> float:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from rotavg_ros.evaluation.common.scoring import Scores
 from rotavg_ros.evaluation.common.tables import Cell, Column, Table
+from rotavg_ros.metrics import OutlierCounts
 
 
 class Figure(NamedTuple):
@@ -31,6 +32,11 @@ def average_rows(scores: Scores, names: Iterable[str], figures: Sequence[Figure]
 def averages(title: str, scores: Scores, names: Iterable[str], figures: Sequence[Figure], *notes: str) -> Table:
     """Averages of every contender."""
     return Table(title, (Column("method"), *columns(figures)), tuple(average_rows(scores, names, figures)), notes)
+
+
+def precision_and_recall(counts: OutlierCounts) -> tuple[Cell, Cell]:
+    """Cells of verdicts; empty where no edge is an outlier: one flag would make 0 of the precision, none 1 of both."""
+    return (counts.precision, counts.recall) if counts.num_outliers else (None, None)
 
 
 # Verdicts on a case, and what they cost.

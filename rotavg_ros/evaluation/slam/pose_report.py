@@ -7,18 +7,22 @@ from pathlib import Path
 
 import numpy as np
 
-from rotavg_ros.evaluation.common.score_tables import VERDICT_FIGURES, Figure, per_case
+from rotavg_ros.evaluation.common.score_tables import VERDICT_FIGURES, Figure, per_case, precision_and_recall
 from rotavg_ros.evaluation.common.scoring import Scores, geometric_mean
 from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS
 from rotavg_ros.evaluation.slam.pose_cases import AS_RECORDED, RECORDED_NOISE
 from rotavg_ros.evaluation.slam.pose_contenders import PEERS, ROWS, TOLD
+from rotavg_ros.metrics import OutlierCounts
 
 _METRES, _DEGREES = "floored_m", "floored_deg"
 _LARGE, _VERY_LARGE = 2.0, 5.0
 # A peer is better where its error is smaller by this factor at least.
 _BETTER = 1.05
 _NUM_WORST = 15
+_NONE_FALSE = (
+    "Where no closure is false, the share of good closures that are not flagged stands in place of the precision."
+)
 _CASE_KEY = {"graph": "name", "condition": "kind", "seed": "seed"}
 _CASE_FIGURES = (
     Figure("ate_m", "ate_m"),
@@ -81,8 +85,7 @@ def _totals(scores: Scores) -> Table:
                 float((ratios > _LARGE).mean()) if len(ratios) else None,
                 float((ratios > _VERY_LARGE).mean()) if len(ratios) else None,
                 geometric_mean(scores.ratios(name, ORACLE, _DEGREES).values()),
-                counts.precision,
-                counts.recall,
+                *_judged(counts),
                 scores.mean(name, "cpu_seconds"),
             )
         )
@@ -139,17 +142,17 @@ def _verdicts(scores: Scores) -> Table:
     for name in scores.contenders:
         cells: list[Cell] = [ROWS.get(name, name)]
         for kind in scores.kinds:
-            counts = scores.where(name, kind=kind).counts()
-            judged = counts.true_positives + counts.false_negatives
-            cells += [counts.precision, counts.recall] if judged else [1 - counts.false_alarm_rate, None]
+            cells += _judged(scores.where(name, kind=kind).counts())
         rows.append(tuple(cells))
     columns = [Column("method")]
     for kind in scores.kinds:
         columns += [Column(f"{kind}: P", ".3f"), Column("R", ".3f")]
-    note = (
-        "Where no closure is false, the share of good closures that are not flagged stands in place of the precision."
-    )
-    return Table("Verdicts on closures: precision and recall", tuple(columns), tuple(rows), (note,))
+    return Table("Verdicts on closures: precision and recall", tuple(columns), tuple(rows), (_NONE_FALSE,))
+
+
+def _judged(counts: OutlierCounts) -> tuple[Cell, Cell]:
+    """Precision and recall, see :data:`_NONE_FALSE`."""
+    return precision_and_recall(counts) if counts.num_outliers else (1 - counts.false_alarm_rate, None)
 
 
 def _recorded(scores: Scores) -> Table:
@@ -159,8 +162,7 @@ def _recorded(scores: Scores) -> Table:
             ROWS.get(row.contender, row.contender),
             row.ate_m,
             row.mean_deg,
-            row.counts.precision,
-            row.counts.recall,
+            *_judged(row.counts),
             row.cpu_seconds,
         )
         for row in scores.rows
@@ -178,7 +180,7 @@ def _recorded(scores: Scores) -> Table:
         f"{'; '.join(left)}. The oracle uses the closures that ground truth knows to be good; where it does not know "
         "some that matter, others are better."
     )
-    return Table("B25b as recorded", columns, tuple(rows), (note,))
+    return Table("B25b as recorded", columns, tuple(rows), (note, _NONE_FALSE))
 
 
 def _better(scores: Scores) -> Table:

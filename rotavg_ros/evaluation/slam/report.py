@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from rotavg_ros.evaluation.common.score_tables import VERDICT_FIGURES, Figure, per_case
+from rotavg_ros.evaluation.common.score_tables import VERDICT_FIGURES, Figure, per_case, precision_and_recall
 from rotavg_ros.evaluation.common.scoring import Scores, geometric_mean
 from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
 from rotavg_ros.evaluation.live import incremental_plot
@@ -120,8 +120,7 @@ def _recorded(title: str, scores: Scores, names: Sequence[str], graphs: Sequence
                         row.case.kind,
                         ROWS.get(name, name),
                         row.mean_deg,
-                        counts.precision,
-                        counts.recall,
+                        *precision_and_recall(counts),
                         100 * counts.false_alarm_rate,
                         row.cpu_seconds,
                     )
@@ -136,7 +135,10 @@ def _recorded(title: str, scores: Scores, names: Sequence[str], graphs: Sequence
         Column("good flagged %", ".2f"),
         Column("CPU s", ".3f"),
     )
-    note = "Methods that give no verdicts are judged by their residuals: a closure with more than 10° is called false."
+    note = (
+        "Methods that give no verdicts are judged by their residuals: a closure with more than 10° is called false. "
+        "Precision and recall are empty where none is."
+    )
     return Table(title, columns, tuple(rows), (note,))
 
 
@@ -146,14 +148,12 @@ def _verdicts(title: str, scores: Scores, names: Sequence[str], graphs: Sequence
         for condition in scores.where(name, graphs).kinds:
             of_condition = scores.where(name, graphs, condition)
             counts = of_condition.counts()
-            has_false = counts.true_positives + counts.false_negatives > 0
             worst = max(of_condition.rows, key=lambda row: row.counts.false_alarm_rate)
             rows.append(
                 (
                     ROWS.get(name, name),
                     condition,
-                    counts.precision if has_false else None,
-                    counts.recall if has_false else None,
+                    *precision_and_recall(counts),
                     100 * counts.false_alarm_rate,
                     100 * worst.counts.false_alarm_rate,
                     worst.case.name,

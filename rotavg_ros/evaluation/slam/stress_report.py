@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rotavg_ros.evaluation.common.score_tables import VERDICT_FIGURES, Figure, per_case
+from rotavg_ros.evaluation.common.score_tables import VERDICT_FIGURES, Figure, per_case, precision_and_recall
 from rotavg_ros.evaluation.common.scoring import Scores, geometric_mean
 from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
 from rotavg_ros.evaluation.slam import same_data, search_or_model, sensitivity, stress_calibration
@@ -139,8 +139,7 @@ def _totals(scores: Scores, names: Sequence[str]) -> Table:
                 geometric_mean(ratios),
                 *_tail(ratios),
                 None if name == ORACLE else len(list(rivals(scores, name))) / max(len(scores.kinds), 1),
-                counts.precision,
-                counts.recall,
+                *precision_and_recall(counts),
                 scores.mean(name, "cpu_seconds"),
             )
         )
@@ -157,7 +156,7 @@ def _totals(scores: Scores, names: Sequence[str]) -> Table:
         Column("CPU s", ".3f"),
     )
     notes = (
-        "Ratios are errors over the oracle's, case by case.",
+        "Ratios are errors over the oracle's, case by case. Precision and recall are empty where no closure is false.",
         f"A peer is better on a kind where the geometric mean of its error over the method's is {1 / _BETTER:.3f} or "
         f"less, and lies more than {_STANDARD_ERRORS:g} standard errors below one. Peers: {', '.join(_PEERS)}.",
         "Cases that a method gave up, or that are too large for it, do not count against it.",

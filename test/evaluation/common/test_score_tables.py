@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rotavg_ros.evaluation.common.cases import CaseKey
-from rotavg_ros.evaluation.common.score_tables import Figure, averages, per_case
+from rotavg_ros.evaluation.common.score_tables import Figure, averages, per_case, precision_and_recall
 from rotavg_ros.evaluation.common.scoring import Score, Scores
 from rotavg_ros.metrics import OutlierCounts
 
@@ -34,3 +34,9 @@ def test_a_row_for_every_case() -> None:
     assert lines[0] == "graph,condition,seed,method,mean °,recall"
     assert lines[1:] == ["graph,kind,0,a,1,1", "graph,kind,0,b,5,1", "graph,kind,1,a,3,0.5"]
     assert per_case("Title", SCORES, FIGURES).to_csv().startswith("graph,method,mean °,recall\ngraph,a,1,1\n")
+
+
+def test_precision_and_recall_of_nothing_are_empty() -> None:
+    assert precision_and_recall(OutlierCounts(3, 1, 2, 5)) == (0.75, 0.6)
+    # Of good closures alone, 0 and 1 would look like a verdict on false ones.
+    assert precision_and_recall(OutlierCounts(0, 4, 0, 112)) == (None, None)

@@ -68,6 +68,14 @@ def test_a_report_of_nothing(tmp_path: Path) -> None:
     assert pose_report.report(tmp_path, Scores(), "rotavg").exists()
 
 
+def test_good_closures_that_a_recorded_graph_alone_has_are_no_precision_of_nothing(tmp_path: Path) -> None:
+    clean = OutlierCounts(0, 4, 0, 112)
+    row = Score(CaseKey("B25b_0.500", "as recorded"), "gnc-true", 1.0, 1.0, 1.0, clean, 1.0, 0, 0.5, 1.0, 1.0)
+    pose_report.report(tmp_path, Scores([row]), "rotavg")
+    (recorded,) = read(tmp_path / "poses-recorded.csv")
+    assert (float(recorded["precision"]), recorded["recall"]) == (pytest.approx(112 / 116, rel=FIVE_DIGITS), "")
+
+
 def test_the_note_on_recorded_graphs_tells_what_each_was_told(tmp_path: Path) -> None:
     row = Score(
         CaseKey("B25b_0.250", "as recorded"), "neurora", 1.0, 1.0, 1.0, OutlierCounts(1, 0, 0, 1), 1.0, 0, 0.5, 1.0, 1.0

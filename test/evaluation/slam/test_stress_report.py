@@ -64,6 +64,12 @@ def test_report(tmp_path: Path) -> None:
     assert read(tmp_path / "stress-worst.csv")[0]["ratio"] == "10"
 
 
+def test_without_false_closures_there_is_no_precision(tmp_path: Path) -> None:
+    clean = [replace(row, counts=OutlierCounts(0, 1, 0, 9)) for row in made_up().rows]
+    stress_report.report(tmp_path, Scores(clean), Findings(Calibration()), "rotavg")
+    assert {(row["precision"], row["recall"]) for row in read(tmp_path / "stress-totals.csv")} == {("", "")}
+
+
 def test_a_report_of_nothing(tmp_path: Path) -> None:
     """Interrupted before the first case was done."""
     assert stress_report.report(tmp_path, Scores(), Findings(Calibration()), "rotavg").exists()
