@@ -193,16 +193,20 @@ def _better(scores: Scores) -> Table:
         Column("its ATE over ours", ".2f"),
         Column("drawings", "d"),
     )
-    note = f"Geometric means of {1 / _BETTER:.3f} or less. Peers: {', '.join(PEERS)}."
+    note = f"Geometric means of {1 / _BETTER:.3f} or less. Peers: {', '.join(_peers(scores)) or 'none'}."
     return Table("Where a peer is better than ours", columns, tuple(found), (note,))
 
 
+def _peers(scores: Scores) -> list[str]:
+    """Those that took part."""
+    return [peer for peer in PEERS if peer in scores.contenders]
+
+
 def _rivals(scores: Scores) -> Iterator[tuple[Cell, ...]]:
-    peers = [peer for peer in PEERS if peer in scores.contenders]
     for graph in scores.names:
         for kind in scores.where(names=[graph]).kinds:
             these = scores.where(names=[graph], kind=kind)
-            ratios = {peer: [*these.ratios(peer, OURS, _METRES).values()] for peer in peers}
+            ratios = {peer: [*these.ratios(peer, OURS, _METRES).values()] for peer in _peers(scores)}
             means = {peer: geometric_mean(values) for peer, values in ratios.items() if values}
             if means:
                 best = min(means, key=lambda peer: means[peer])

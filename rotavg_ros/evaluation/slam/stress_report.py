@@ -109,11 +109,16 @@ def report(
 
 def rivals(scores: Scores, name: str) -> Iterator[Rival]:
     """On every kind of at least two common cases the peer that beats the contender by most, if any does."""
-    peers = [peer for peer in _PEERS if peer in scores.contenders and peer != name]
+    peers = [peer for peer in _peers(scores) if peer != name]
     for kind in scores.kinds:
         of_kind = [rival for peer in peers if (rival := _rival(scores, kind, peer, name)) is not None]
         if of_kind:
             yield min(of_kind, key=lambda rival: rival.ratio)
+
+
+def _peers(scores: Scores) -> list[str]:
+    """Those that took part."""
+    return [peer for peer in _PEERS if peer in scores.contenders]
 
 
 def _rival(scores: Scores, kind: str, peer: str, name: str) -> Rival | None:
@@ -158,7 +163,8 @@ def _totals(scores: Scores, names: Sequence[str]) -> Table:
     notes = (
         "Ratios are errors over the oracle's, case by case. Precision and recall are empty where no closure is false.",
         f"A peer is better on a kind where the geometric mean of its error over the method's is {1 / _BETTER:.3f} or "
-        f"less, and lies more than {_STANDARD_ERRORS:g} standard errors below one. Peers: {', '.join(_PEERS)}.",
+        f"less, and lies more than {_STANDARD_ERRORS:g} standard errors below one. Peers: "
+        f"{', '.join(_peers(scores)) or 'none'}.",
         "Cases that a method gave up, or that are too large for it, do not count against it.",
     )
     return Table("All kinds", columns, tuple(rows), notes)

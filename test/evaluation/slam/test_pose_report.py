@@ -44,6 +44,7 @@ def read(path: Path) -> list[dict[str, str]]:
 def test_report(tmp_path: Path) -> None:
     path = pose_report.report(tmp_path, made_up(), "rotavg evaluate slam --suite poses")
     text = path.read_text(encoding="utf-8")
+    assert "Peers: gnc-true.\n" in text
     assert "4 drawings (seeds 0, 1)" in text and "1 recorded graphs" in text
     ours, gnc, oracle = read(tmp_path / "poses-totals.csv")
     assert float(ours["ATE ratio"]) == pytest.approx((1 * 4 * 3 * 3) ** (1 / 4), rel=FIVE_DIGITS)

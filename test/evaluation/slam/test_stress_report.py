@@ -62,6 +62,8 @@ def test_report(tmp_path: Path) -> None:
     assert (better["kind"], better["cases"]) == ("hard", "3")
     assert len(read(tmp_path / "stress-cases.csv")) == 18
     assert read(tmp_path / "stress-worst.csv")[0]["ratio"] == "10"
+    # Not those that could have taken part.
+    assert "Peers: gnc.\n" in (tmp_path / "stress.md").read_text(encoding="utf-8")
 
 
 def test_without_false_closures_there_is_no_precision(tmp_path: Path) -> None:
