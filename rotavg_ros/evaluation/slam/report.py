@@ -74,9 +74,10 @@ def report(
     introduction = (
         f"`{command}`. Error: mean angle between estimated and true orientations after one robust global rotation. "
         "Where a graph has no ground truth, its clean least-squares solution stands in for it. The oracle is least "
-        "squares, with the stated precisions, on the edges that are known to be good. Errors below 0.1° (0.3° without "
-        "ground truth) count as that much. A closure is false if its noise exceeds 10°; those between 8° and 12° do "
-        "not count in verdicts, nor do random ones that happen to fit."
+        "squares, with the stated precisions, on the rotations of edges that are known to be good; on B25b ours uses "
+        "translations, too. Errors below 0.1° (0.3° without ground truth) count as that much. A closure is false if "
+        "its noise exceeds 10°; those between 8° and 12° do not count in verdicts, nor do random ones that happen to "
+        "fit."
     )
     cases = {"slam-cases": per_case("Every case", scores, _CASE_FIGURES, _CASE_KEY)}
     return Report("slam", "SLAM pose graphs", introduction, tables, pictures, cases).write(folder)

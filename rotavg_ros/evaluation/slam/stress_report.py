@@ -21,6 +21,8 @@ _FIGURE = "floored_deg"
 _LARGE, _VERY_LARGE = 2.0, 5.0
 # A peer is better where its error is smaller by at least this factor, and by more than this many standard errors.
 _BETTER, _STANDARD_ERRORS = 1.05, 2.0
+# Of fewer common cases there is no standard error.
+_LEAST_CASES = 2
 # Who counts as a peer: independent methods, none of which is told what only an oracle knows.
 _PEERS = (*ROSTER.peers, "chatterjee")
 _NUM_WORST = 20
@@ -101,8 +103,8 @@ def report(
     introduction = (
         f"`{command}`. Simulated pose graphs that are hard in one known way each. Error: mean angle between estimated "
         "and true orientations after one robust global rotation of each component; below 0.1° it counts as 0.1°. The "
-        "oracle is least squares on the edges that are good, with their true variances. A closure is false if its "
-        "noise exceeds 10°; those between 8° and 12° do not count in verdicts."
+        "oracle is least squares on the rotations of edges that are good, with their true variances. A closure is "
+        "false if its noise exceeds 10°; those between 8° and 12° do not count in verdicts."
     )
     return Report("stress", "Stress suite", introduction, tables, extra_csv=long).write(folder)
 
@@ -124,7 +126,7 @@ def _peers(scores: Scores) -> list[str]:
 def _rival(scores: Scores, kind: str, peer: str, name: str) -> Rival | None:
     """The peer as a rival; None if it is not significantly better."""
     logarithms = np.log(list(scores.ratios(peer, name, _FIGURE, kind).values()))
-    if len(logarithms) < 2:
+    if len(logarithms) < _LEAST_CASES:
         return None
     mean, error = float(logarithms.mean()), float(logarithms.std(ddof=1) / np.sqrt(len(logarithms)))
     is_better = -mean > np.log(_BETTER) and -mean > _STANDARD_ERRORS * error
@@ -143,7 +145,7 @@ def _totals(scores: Scores, names: Sequence[str]) -> Table:
                 float(np.log(ratios).mean()) if len(ratios) else None,
                 geometric_mean(ratios),
                 *_tail(ratios),
-                None if name == ORACLE else len(list(rivals(scores, name))) / max(len(scores.kinds), 1),
+                None if name == ORACLE else _share_lost(scores, name),
                 *precision_and_recall(counts),
                 scores.mean(name, "cpu_seconds"),
             )
@@ -165,9 +167,20 @@ def _totals(scores: Scores, names: Sequence[str]) -> Table:
         f"A peer is better on a kind where the geometric mean of its error over the method's is {1 / _BETTER:.3f} or "
         f"less, and lies more than {_STANDARD_ERRORS:g} standard errors below one. Peers: "
         f"{', '.join(_peers(scores)) or 'none'}.",
+        "Kinds without two common cases cannot tell; where none can, the share is empty.",
         "Cases that a method gave up, or that are too large for it, do not count against it.",
     )
     return Table("All kinds", columns, tuple(rows), notes)
+
+
+def _share_lost(scores: Scores, name: str) -> float | None:
+    """Share of the kinds on which a peer is better, among those where that can be told; None: on none."""
+    peers = [peer for peer in _peers(scores) if peer != name]
+    compared = (
+        max((len(scores.ratios(peer, name, _FIGURE, kind)) for peer in peers), default=0) for kind in scores.kinds
+    )
+    can_be_told = sum(cases >= _LEAST_CASES for cases in compared)
+    return len([*rivals(scores, name)]) / can_be_told if can_be_told else None
 
 
 def _means(scores: Scores, names: Sequence[str]) -> Table:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -56,14 +57,24 @@ def test_report(tmp_path: Path) -> None:
     ours, gnc, oracle = read(tmp_path / "stress-totals.csv")
     assert float(ours["share over 2×"]) == 0.5
     assert float(ours["kinds where a peer is better"]) == 0.5
-    assert float(gnc["kinds where a peer is better"]) == 0
-    assert oracle["kinds where a peer is better"] == ""
+    # Of the only peer no other can be told to be better.
+    assert gnc["kinds where a peer is better"] == oracle["kinds where a peer is better"] == ""
     (better,) = read(tmp_path / "stress-better.csv")
     assert (better["kind"], better["cases"]) == ("hard", "3")
     assert len(read(tmp_path / "stress-cases.csv")) == 18
     assert read(tmp_path / "stress-worst.csv")[0]["ratio"] == "10"
     # Not those that could have taken part.
     assert "Peers: gnc.\n" in (tmp_path / "stress.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    "told", [lambda row: row.contender != "gnc", lambda row: row.case.seed == 0], ids=["no peer", "one case of a kind"]
+)
+def test_nobody_is_said_to_be_no_better_where_that_cannot_be_told(
+    tmp_path: Path, told: Callable[[Score], bool]
+) -> None:
+    stress_report.report(tmp_path, Scores([*filter(told, made_up().rows)]), Findings(Calibration()), "rotavg")
+    assert {row["kinds where a peer is better"] for row in read(tmp_path / "stress-totals.csv")} == {""}
 
 
 def test_without_false_closures_there_is_no_precision(tmp_path: Path) -> None:
