@@ -10,7 +10,8 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.view_graph import ViewGraph
 
-_ALIGNMENT_ITERATIONS = 30
+# An answer that is right or wrong all over takes 30 at most, one of two halves turned apart hundreds.
+_MAX_ALIGNMENT_ITERATIONS = 1000
 _SMOOTHING = np.radians(0.01)
 
 
@@ -28,7 +29,7 @@ def gauge_alignment(estimate: Tensor, truth: Tensor) -> Tensor:
     difference = rotations.multiply(rotations.inverse(truth), estimate)
     # The chordal mean, the dominant eigenvector of Σ q qᵀ, starts the iteration for the median.
     gauge = torch.linalg.eigh(difference.T @ difference).eigenvectors[:, -1]
-    for _ in range(_ALIGNMENT_ITERATIONS):
+    for _ in range(_MAX_ALIGNMENT_ITERATIONS):
         deviation = rotations.log(rotations.multiply(rotations.inverse(gauge), difference))
         weight = 1 / deviation.norm(dim=1, keepdim=True).clamp(min=_SMOOTHING)
         step = (weight * deviation).sum(0) / weight.sum()

@@ -7,6 +7,7 @@ import pytest
 import torch
 from evo.core.metrics import APE, RPE, PoseRelation, Unit
 from evo.core.trajectory import PosePath3D
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import rotations
@@ -40,6 +41,22 @@ def test_absolute_errors_are_evos() -> None:
     metric = APE(PoseRelation.rotation_angle_rad)
     metric.process_data((path_of(true), path_of(gauge * estimate)))
     np.testing.assert_allclose(ours.numpy(), metric.error, atol=1e-9)
+
+
+def test_an_answer_of_two_halves_turned_apart_is_laid_onto_the_larger_one() -> None:
+    """49 % of it are turned by 100°: a median that is given up too early lies between the two."""
+    rng = np.random.default_rng(0)
+    true = Rotation.random(300, rng=rng)
+    turn = np.where(np.arange(300)[:, None] < 147, [0.0, 0.0, np.radians(100.0)], 0.0)
+    estimate = Rotation.from_rotvec(turn + rng.normal(scale=np.radians(0.5), size=(300, 3))) * true
+    errors = orientation_errors(body_from_world(estimate), body_from_world(true))
+
+    def mean_error(gauge: np.ndarray) -> float:
+        return float((Rotation.from_rotvec(gauge) * estimate * true.inv()).magnitude().mean())
+
+    best = minimize(mean_error, np.zeros(3), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12})
+    assert float(errors.mean()) == pytest.approx(best.fun, abs=1e-6)
+    assert float(errors.median()) < np.radians(5.0)
 
 
 @pytest.mark.parametrize("delta", [1, 7])
