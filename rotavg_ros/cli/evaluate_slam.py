@@ -78,16 +78,18 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
     calibration, same_data = Calibration(), SameData()
     chosen[OURS] = same_data.watching(calibration.watching(chosen[OURS]))
 
-    scores = score_all(drawings(kinds, seeds), chosen, _watch(len(kinds) * len(seeds) * len(chosen)))
+    scores = score_all(drawings(kinds, seeds), chosen, _watch(num_drawings(kinds, seeds) * len(chosen)))
     diagnoses: list[Diagnosis] = []
     if arguments.search_or_model and not scores.interrupted:
         with until_interrupted():  # what is done by then is written
-            cases_again = progress(drawings(kinds, seeds), total=len(kinds) * len(seeds), description="from the truth")
+            cases_again = progress(
+                drawings(kinds, seeds), total=num_drawings(kinds, seeds), description="from the truth"
+            )
             diagnoses.extend(map(diagnose, cases_again))
     priors: list[list[sensitivity.Answer]] = []
     if arguments.sensitivity and not scores.interrupted:
         with until_interrupted():
-            cases_again = progress(drawings(kinds, seeds), total=len(kinds) * len(seeds), description="other priors")
+            cases_again = progress(drawings(kinds, seeds), total=num_drawings(kinds, seeds), description="other priors")
             priors.extend([*sensitivity.answers(case)] for case in cases_again)
     findings = stress_report.Findings(calibration, same_data, diagnoses, priors)
     with working("writing the report"):

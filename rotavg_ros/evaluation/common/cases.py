@@ -171,13 +171,14 @@ class Kind:
 
 def num_drawings(kinds: Iterable[Kind], seeds: Sequence[int]) -> int:
     """Largest number of cases that :func:`drawings` yields; it leaves out those that cannot be drawn."""
-    return sum(len(seeds) if kind.is_random else 1 for kind in kinds)
+    return sum(len(set(seeds)) if kind.is_random else 1 for kind in kinds)
 
 
 def drawings(kinds: Iterable[Kind], seeds: Sequence[int]) -> Iterator[Case]:
-    """Every kind with every seed, drawn on demand."""
+    """Every kind with every seed, drawn on demand. Named twice is named once."""
+    once = tuple(dict.fromkeys(seeds))
     for kind in kinds:
-        for seed in seeds if kind.is_random else seeds[:1]:
+        for seed in once if kind.is_random else once[:1]:
             case = kind.draw(seed)
             if case is not None:
                 yield case

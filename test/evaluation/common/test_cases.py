@@ -5,7 +5,17 @@ from __future__ import annotations
 import torch
 
 from rotavg_ros import rotations
-from rotavg_ros.evaluation.common.cases import SFM, SLAM, Case, CaseKey, Family, Kind, drawings, warm_up_case
+from rotavg_ros.evaluation.common.cases import (
+    SFM,
+    SLAM,
+    Case,
+    CaseKey,
+    Family,
+    Kind,
+    drawings,
+    num_drawings,
+    warm_up_case,
+)
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -49,6 +59,11 @@ def test_drawings() -> None:
     assert drawn == [0, 1, 2, 0]
     assert len(found) == 3
     assert not list(drawings([], [0]))
+    # Of a seed that is named twice there is one case, or its verdicts would count twice.
+    drawn.clear()
+    random = [Kind("random", draw)]
+    assert len(list(drawings(random, [2, 0, 2]))) == num_drawings(random, [2, 0, 2]) == 2
+    assert drawn == [2, 0]
 
 
 def test_names() -> None:
