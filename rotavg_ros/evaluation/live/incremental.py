@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -33,7 +34,7 @@ class IncrementalRun:
         flips: ``(T,)`` closures whose flag changed since the tick before.
         false_flagged, good_flagged, false_seen, good_seen: ``(T,)`` counts of closures so far.
         jump_deg: ``(T,)`` largest turn of a keyframe that the tick before knew, too.
-        seconds: ``(T,)`` of every tick.
+        seconds, after_seconds: ``(T,)`` of every tick, until its answer and of the work that goes on after it.
     """
 
     case: Case
@@ -47,6 +48,7 @@ class IncrementalRun:
     good_seen: np.ndarray
     jump_deg: np.ndarray
     seconds: np.ndarray
+    after_seconds: np.ndarray
 
     @property
     def worst_excess_deg(self) -> float:
@@ -79,7 +81,9 @@ def play(
     for end in watch(ends):
         feed.until(end)
         answer = estimator.tick()
+        answered = time.perf_counter()
         estimator.go_on()
+        after_seconds = time.perf_counter() - answered
         if answer is None:
             continue
         node = torch.from_numpy(answer.keyframe_id.astype(np.int64))
@@ -106,6 +110,7 @@ def play(
                 int(is_good[closures].sum()),
                 float(torch.rad2deg(turned.max())) if known else 0.0,
                 answer.seconds,
+                after_seconds,
             )
         )
         orientations = now

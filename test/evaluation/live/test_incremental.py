@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rotavg_ros.evaluation.common.scoring import score
-from rotavg_ros.evaluation.live import incremental
+from rotavg_ros.evaluation.live import incremental, tables
 from rotavg_ros.evaluation.slam import pose_cases
 
 from ..laps import NUM_NODES, answer_of, spoiled
@@ -25,6 +25,7 @@ def test_incremental_run_ends_like_the_batch_solve() -> None:
     batch = score(case, "neurora", answer_of("neurora", case))
     assert run.error_deg[-1] == pytest.approx(batch.mean_deg, abs=0.1)
     assert np.isnan(run.worst_excess_deg)  # a short run settles nothing
+    assert (run.after_seconds > 0).all()
 
 
 @pytest.mark.large
@@ -37,3 +38,16 @@ def test_a_right_rotation_is_not_flagged_for_the_wrong_place_that_it_joins(monke
     by_places, by_rotations = incremental.play(case), incremental.play(replace(case, poses=None))
     assert by_places.false_flagged[-1] > 0.8 * by_places.false_seen[-1] > 8
     assert by_rotations.good_flagged[-1] < 0.3 * by_places.false_flagged[-1]
+
+
+def test_work_after_an_answer_is_told_beside_it() -> None:
+    """It takes several times as long: of both together, or of one of them, "a tick" says nothing."""
+    zeros = np.zeros(2)
+    run = incremental.IncrementalRun(
+        spoiled(), np.array([10.0, 20.0]), *[zeros] * 8, seconds=np.array([0.01, 0.03]), after_seconds=zeros + 0.1
+    )
+    table = tables.incremental("Incremental", [run])
+    (row,) = table.rows
+    told = dict(zip((column.heading for column in table.columns), row, strict=True))
+    assert [told[f"answer {quantile} ms"] for quantile in ("p50", "p95")] == pytest.approx([20, 29])
+    assert [told[f"after it {quantile} ms"] for quantile in ("p50", "p95")] == pytest.approx([100, 100])
