@@ -29,7 +29,7 @@ Medians over the solves of a process, {repeats} or as many as begin within {enou
 graph in memory → orientations in memory; {threads} for every solver. CPU seconds are those of all threads. Peak
 memory is the whole process's, with interpreter, libraries and the graph; beside it what it was before the first
 solve. Errors are against the truth after one rotation of the world. GNC gets the odometry as known inliers and as its
-start, and the precisions that the graph states; it and Shonan are timed without what it takes to build their graphs.
+start, and the precisions that the graph states; peers are timed without what it takes to build their graphs.
 
 The load average was {load} before the run{quiet}
 
