@@ -11,7 +11,7 @@ from rotavg_ros.evaluation.common.score_tables import VERDICT_FIGURES, Figure, p
 from rotavg_ros.evaluation.common.scoring import Scores, geometric_mean
 from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS
-from rotavg_ros.evaluation.slam.pose_cases import AS_RECORDED, RECORDED_NOISE
+from rotavg_ros.evaluation.slam.pose_cases import AS_RECORDED, JUMPS, RECORDED_NOISE
 from rotavg_ros.evaluation.slam.pose_contenders import PEERS, ROWS, TOLD
 from rotavg_ros.metrics import OutlierCounts
 
@@ -41,7 +41,10 @@ def report(folder: Path, scores: Scores, command: str) -> Path:
     recorded = scores.where(kind=AS_RECORDED)
     tables: dict[str, Table] = {}
     if drawn.rows:
-        tables["poses-totals"] = _totals(drawn)
+        tables["poses-totals"] = _totals("All drawings", drawn)
+        sound = Scores([row for row in drawn.rows if row.case.kind != JUMPS])
+        if 0 < len(sound.rows) < len(drawn.rows):
+            tables["poses-sound"] = _totals("Drawings whose odometry is right, as peers are told", sound)
         tables["poses-positions"] = _by("Positions: geometric mean of ATE over the oracle's", drawn, _METRES, "kind")
         tables["poses-orientations"] = _by(
             "Orientations: geometric mean of the mean error over the oracle's", drawn, _DEGREES, "kind"
@@ -71,7 +74,7 @@ def report(folder: Path, scores: Scores, command: str) -> Path:
     ).write(folder)
 
 
-def _totals(scores: Scores) -> Table:
+def _totals(title: str, scores: Scores) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for name in scores.contenders:
         ratios = np.array([*scores.ratios(name, ORACLE, _METRES).values()])
@@ -105,8 +108,9 @@ def _totals(scores: Scores) -> Table:
         "Closures of right rotation that join wrong places still tell rotations, and the oracle does without them: "
         "ratios may lie below one.",
         "Cases that a method gave up, or that are too large for it, do not count against it.",
+        *((f"Under {JUMPS!r} odometry is not right, as peers are told.",) if JUMPS in scores.kinds else ()),
     )
-    return Table("All drawings", columns, tuple(rows), notes)
+    return Table(title, columns, tuple(rows), notes)
 
 
 def _by(title: str, scores: Scores, figure: str, key: str) -> Table:

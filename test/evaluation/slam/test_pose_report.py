@@ -9,7 +9,8 @@ import pytest
 
 from rotavg_ros.evaluation.common.cases import CaseKey
 from rotavg_ros.evaluation.common.scoring import Score, Scores
-from rotavg_ros.evaluation.slam import pose_report
+from rotavg_ros.evaluation.slam import pose_cases, pose_report
+from rotavg_ros.evaluation.slam.pose_contenders import ROWS
 from rotavg_ros.metrics import OutlierCounts
 
 FIVE_DIGITS = 1e-4  # relative, as CSV files have them
@@ -45,6 +46,7 @@ def test_report(tmp_path: Path) -> None:
     path = pose_report.report(tmp_path, made_up(), "rotavg evaluate slam --suite poses")
     text = path.read_text(encoding="utf-8")
     assert "Peers: gnc-true.\n" in text
+    assert not (tmp_path / "poses-sound.csv").exists()
     assert "4 drawings (seeds 0, 1)" in text and "1 recorded graphs" in text
     ours, gnc, oracle = read(tmp_path / "poses-totals.csv")
     assert float(ours["ATE ratio"]) == pytest.approx((1 * 4 * 3 * 3) ** (1 / 4), rel=FIVE_DIGITS)
@@ -62,6 +64,21 @@ def test_report(tmp_path: Path) -> None:
     assert [row["method"] for row in read(tmp_path / "poses-recorded.csv")][1].startswith("GNC")
     assert len(read(tmp_path / "poses-cases.csv")) == 15
     assert read(tmp_path / "poses-worst.csv")[0]["condition"] == "as recorded"
+
+
+def test_peers_that_are_told_that_odometry_is_right_are_compared_also_where_it_is(tmp_path: Path) -> None:
+    counts = OutlierCounts(9, 1, 0, 20)
+    scores = made_up()
+    for name, metres in (("neurora", 0.1), ("gnc-true", 8.0), ("oracle", 0.1)):
+        scores.rows += scored(name, pose_cases.JUMPS, [metres], counts)
+    text = pose_report.report(tmp_path, scores, "rotavg").read_text(encoding="utf-8")
+    assert f"Under '{pose_cases.JUMPS}' odometry is not right" in text
+    everything, sound = (
+        {row["method"]: float(row["ATE ratio"]) for row in read(tmp_path / f"poses-{table}.csv")}
+        for table in ("totals", "sound")
+    )
+    gnc = ROWS["gnc-true"]
+    assert (everything[gnc], sound[gnc]) == pytest.approx(((4 * 80) ** (1 / 5), 4 ** (1 / 4)), rel=FIVE_DIGITS)
 
 
 def test_a_report_of_nothing(tmp_path: Path) -> None:
