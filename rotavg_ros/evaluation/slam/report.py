@@ -140,7 +140,11 @@ def _recorded(title: str, scores: Scores, names: Sequence[str], graphs: Sequence
         "Methods that give no verdicts are judged by their residuals: a closure with more than 10° is called false. "
         "Precision and recall are empty where none is."
     )
-    return Table(title, columns, tuple(rows), (note,))
+    oracle = (
+        "The oracle does without closures whose truth is unknown, be they good or false: where some of these matter, "
+        "others are better."
+    )
+    return Table(title, columns, tuple(rows), (note, oracle))
 
 
 def _verdicts(title: str, scores: Scores, names: Sequence[str], graphs: Sequence[str]) -> Table:
