@@ -104,7 +104,8 @@ def _totals(title: str, scores: Scores) -> Table:
         Column("CPU s", ".2f"),
     )
     notes = (
-        "Ratios are errors over the oracle's, geometric means. Precision and recall are of all closures together.",
+        "Ratios are errors over the oracle's, geometric means. Precision and recall are of all closures together. "
+        f"{_NONE_FALSE}",
         "Closures of right rotation that join wrong places still tell rotations, and the oracle does without them: "
         "ratios may lie below one.",
         "Cases that a method gave up, or that are too large for it, do not count against it.",

@@ -48,6 +48,8 @@ def test_report(tmp_path: Path) -> None:
     assert "Peers: gnc-true.\n" in text
     assert not (tmp_path / "poses-sound.csv").exists()
     assert "4 drawings (seeds 0, 1)" in text and "1 recorded graphs" in text
+    totals = text.partition("## Positions")[0]
+    assert "share of good closures that are not flagged stands in place" in totals
     ours, gnc, oracle = read(tmp_path / "poses-totals.csv")
     assert float(ours["ATE ratio"]) == pytest.approx((1 * 4 * 3 * 3) ** (1 / 4), rel=FIVE_DIGITS)
     assert float(ours["share over 2×"]) == 0.75
