@@ -36,6 +36,10 @@ class OutlierCounts:
         return self.true_positives + self.false_negatives
 
     @property
+    def num_inliers(self) -> int:
+        return self.false_positives + self.true_negatives
+
+    @property
     def precision(self) -> float:
         """Share of the flagged edges that are outliers; 1 if none is flagged."""
         flagged = self.true_positives + self.false_positives
@@ -54,8 +58,7 @@ class OutlierCounts:
     @property
     def false_alarm_rate(self) -> float:
         """Share of the inliers that are flagged; 0 if there is none."""
-        inliers = self.false_positives + self.true_negatives
-        return self.false_positives / inliers if inliers else 0.0
+        return self.false_positives / self.num_inliers if self.num_inliers else 0.0
 
 
 def roc_area(value: np.ndarray, is_positive: np.ndarray) -> float:

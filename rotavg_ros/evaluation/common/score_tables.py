@@ -39,6 +39,11 @@ def precision_and_recall(counts: OutlierCounts) -> tuple[Cell, Cell]:
     return (counts.precision, counts.recall) if counts.num_outliers else (None, None)
 
 
+def good_flagged(counts: OutlierCounts) -> float | None:
+    """Share of the good edges that are flagged, as a cell: empty where there is none."""
+    return counts.false_alarm_rate if counts.num_inliers else None
+
+
 # Verdicts on a case, and what they cost.
 VERDICT_FIGURES = (
     Figure("counts.true_positives", "false_flagged"),

@@ -7,7 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rotavg_ros.evaluation.common.score_tables import VERDICT_FIGURES, Figure, per_case, precision_and_recall
+from rotavg_ros.evaluation.common.score_tables import (
+    VERDICT_FIGURES,
+    Figure,
+    good_flagged,
+    per_case,
+    precision_and_recall,
+)
 from rotavg_ros.evaluation.common.scoring import Scores, geometric_mean
 from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS
@@ -157,7 +163,10 @@ def _verdicts(scores: Scores) -> Table:
 
 def _judged(counts: OutlierCounts) -> tuple[Cell, Cell]:
     """Precision and recall, see :data:`_NONE_FALSE`."""
-    return precision_and_recall(counts) if counts.num_outliers else (1 - counts.false_alarm_rate, None)
+    if counts.num_outliers:
+        return precision_and_recall(counts)
+    flagged = good_flagged(counts)
+    return None if flagged is None else 1 - flagged, None
 
 
 def _recorded(scores: Scores) -> Table:

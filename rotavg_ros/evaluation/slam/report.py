@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from rotavg_ros.evaluation.common.score_tables import VERDICT_FIGURES, Figure, per_case, precision_and_recall
+from rotavg_ros.evaluation.common.score_tables import (
+    VERDICT_FIGURES,
+    Figure,
+    good_flagged,
+    per_case,
+    precision_and_recall,
+)
 from rotavg_ros.evaluation.common.scoring import Scores, geometric_mean
 from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
 from rotavg_ros.evaluation.live import incremental_plot
@@ -122,7 +128,7 @@ def _recorded(title: str, scores: Scores, names: Sequence[str], graphs: Sequence
                         ROWS.get(name, name),
                         row.mean_deg,
                         *precision_and_recall(counts),
-                        100 * counts.false_alarm_rate,
+                        _percent(good_flagged(counts)),
                         row.cpu_seconds,
                     )
                 )
@@ -159,8 +165,8 @@ def _verdicts(title: str, scores: Scores, names: Sequence[str], graphs: Sequence
                     ROWS.get(name, name),
                     condition,
                     *precision_and_recall(counts),
-                    100 * counts.false_alarm_rate,
-                    100 * worst.counts.false_alarm_rate,
+                    _percent(good_flagged(counts)),
+                    _percent(good_flagged(worst.counts)),
                     worst.case.name,
                 )
             )
@@ -174,6 +180,10 @@ def _verdicts(title: str, scores: Scores, names: Sequence[str], graphs: Sequence
         Column("of"),
     )
     return Table(title, columns, tuple(rows), ("Over all closures of all graphs and seeds.",))
+
+
+def _percent(share: float | None) -> Cell:
+    return None if share is None else 100 * share
 
 
 def _worst(title: str, scores: Scores, graphs: Sequence[str]) -> Table:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rotavg_ros.evaluation.common.cases import CaseKey
-from rotavg_ros.evaluation.common.score_tables import Figure, averages, per_case, precision_and_recall
+from rotavg_ros.evaluation.common.score_tables import Figure, averages, good_flagged, per_case, precision_and_recall
 from rotavg_ros.evaluation.common.scoring import Score, Scores
 from rotavg_ros.metrics import OutlierCounts
 
@@ -40,3 +40,4 @@ def test_precision_and_recall_of_nothing_are_empty() -> None:
     assert precision_and_recall(OutlierCounts(3, 1, 2, 5)) == (0.75, 0.6)
     # Of good closures alone, 0 and 1 would look like a verdict on false ones.
     assert precision_and_recall(OutlierCounts(0, 4, 0, 112)) == (None, None)
+    assert (good_flagged(OutlierCounts(0, 1, 0, 3)), good_flagged(OutlierCounts(5, 0, 1, 0))) == (0.25, None)

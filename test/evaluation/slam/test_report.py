@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -47,3 +48,7 @@ def test_recorded_graphs_without_false_closures(tmp_path: Path) -> None:
     assert "The oracle does without closures whose truth is unknown" in text
     (_, line) = (tmp_path / "slam-recorded.csv").read_text(encoding="utf-8").splitlines()
     assert line.split(",")[3:] == ["2", "", "", "3.4483", "0.5"]
+    # The first fifth of some has no closure yet: nothing is flagged of nothing.
+    report.report(tmp_path, Scores([replace(row, counts=OutlierCounts(0, 0, 0, 0))]), [], [], "rotavg evaluate slam")
+    (_, line) = (tmp_path / "slam-recorded.csv").read_text(encoding="utf-8").splitlines()
+    assert line.split(",")[3:] == ["2", "", "", "", "0.5"]
