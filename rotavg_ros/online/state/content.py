@@ -185,7 +185,9 @@ def _kept_labels(arrays: Arrays, graph: ViewGraph, queued: NDArray[np.bool_]) ->
     """The labels in the order in which edges enter now; None if they are invalid: then a whole search comes first."""
     entered = np.flatnonzero(~queued)
     with suppress(KeyError, ValueError, IndexError):
-        now = arrays | {name: arrays[name][..., entered] for name in ("trusted", "places")}
+        # Files of before do not say about which axis a bias is.
+        now = {"bias_axis": np.empty(0)} | arrays
+        now |= {name: arrays[name][..., entered] for name in ("trusted", "places")}
         return KeptLabels.of_arrays(graph.select_edges(torch.from_numpy(entered)), now)
     return None
 

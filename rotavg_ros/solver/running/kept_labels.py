@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, ViewGraph
 
-_NAMES = ("trusted", "noise", "calibration", "places", "pose_noise", "search")
+_NAMES = ("trusted", "noise", "calibration", "bias_axis", "places", "pose_noise", "search")
 # Single precision saves a millisecond: each tick sends these from the solver's process to the node's.
 _TYPES = {"places": np.float32}
 
@@ -27,6 +27,7 @@ class KeptLabels:
         noise: ``(n,)`` parameters of rotations' noise, in the solver's order.
         calibration: ``(6,)`` gyroscope bias that was taken out of the odometry, rad per step, and error of the mounting
             that was taken out of the closures, rad; ``(0,)`` if nothing was.
+        bias_axis: ``(3,)`` unit vector of the body, about which alone the bias may be; ``(0,)``: about any.
         places: ``(R, M)`` float32 probabilities of what closures' places may be, and their weights, in the solver's
             order.
         pose_noise: ``(m,)`` parameters of the noise of poses, likewise; ``(0,)`` if translations were not used.
@@ -38,6 +39,7 @@ class KeptLabels:
     trusted: np.ndarray
     noise: np.ndarray
     calibration: np.ndarray
+    bias_axis: np.ndarray
     places: np.ndarray
     pose_noise: np.ndarray
     search: np.ndarray
@@ -70,9 +72,11 @@ class KeptLabels:
         """
         found = cls(graph, *(np.asarray(arrays[name], _TYPES.get(name, np.float64)) for name in _NAMES))
         trusted, noise, places = found.trusted, (found.noise, found.pose_noise, found.search), found.places
-        is_flat = all(numbers.ndim == 1 for numbers in (trusted, *noise)) and found.calibration.shape in {(0,), (6,)}
+        calibration, axis = found.calibration, found.bias_axis
+        is_flat = all(numbers.ndim == 1 for numbers in (trusted, *noise)) and calibration.shape in {(0,), (6,)}
         if (
             not is_flat
+            or axis.shape not in {(0,), (3,)}
             or len(found.search) != 3
             or len(trusted) > graph.num_edges
             or places.ndim != 2
@@ -82,8 +86,10 @@ class KeptLabels:
         if ((trusted < 0) | (trusted > 1)).any() or ((places < 0) | np.isinf(places)).any():
             raise ValueError("labels beyond 0 to 1")
         numbers = np.concatenate(noise)
-        if not (np.isfinite(numbers) & (numbers >= 0)).all() or not np.isfinite(found.calibration).all():
+        if not (np.isfinite(numbers) & (numbers >= 0)).all() or not np.isfinite(calibration).all():
             raise ValueError("noise below 0, or a calibration that is no number")
+        if len(axis) and not abs(np.linalg.norm(axis) - 1) <= UNIT_NORM_TOLERANCE:
+            raise ValueError("an axis that is no unit vector")
         return found
 
     def of_edges(self, edges: np.ndarray, num_edges: int) -> dict[str, np.ndarray]:

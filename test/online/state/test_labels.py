@@ -163,6 +163,8 @@ def test_a_file_whose_components_are_none_is_refused(values: np.ndarray, tmp_pat
         ("labels_noise", np.zeros(10)),
         ("labels_noise", np.ones(3)),
         ("labels_calibration", np.full(6, np.inf)),
+        ("labels_bias_axis", np.zeros(3)),
+        ("labels_bias_axis", np.full(3, np.nan)),
         ("labels_pose_noise", np.full(7, -1.0)),
         ("labels_search", np.zeros(2)),
     ],
@@ -191,3 +193,17 @@ def test_a_bias_that_version_6_kept_is_a_calibration(bias: np.ndarray, tmp_path:
     kept = state_file.read(path)["labels_calibration"]
     np.testing.assert_array_equal(kept[:3], bias)
     assert not kept[3:].any()
+
+
+def test_a_file_that_does_not_say_about_which_axis_a_bias_is(tmp_path: Path) -> None:
+    """As this version wrote them before; the bias may be about any axis."""
+    path = tmp_path / "state.npz"
+    saved(path)
+    arrays = state_file.read(path)
+    assert arrays.pop("labels_bias_axis").shape == (0,)
+    state_file.write(path, arrays | {"labels_calibration": np.array([0.001, -0.002, 0.0005, 0, 0, 0])})
+    online = loaded(path)
+    assert is_without_a_search(answered(online))
+    online.save(path)
+    assert state_file.read(path)["labels_bias_axis"].shape == (0,)
+    assert state_file.read(path)["labels_calibration"].shape == (6,)

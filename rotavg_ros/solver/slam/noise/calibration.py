@@ -31,9 +31,9 @@ class Calibration:
     axis: np.ndarray | None = None
 
     @classmethod
-    def of(cls, vector: np.ndarray) -> Calibration:
-        """From :attr:`vector`."""
-        return cls(vector[:3], vector[3:])
+    def of(cls, vector: np.ndarray, axis: np.ndarray | None) -> Calibration:
+        """From :attr:`vector` and :attr:`axis`."""
+        return cls(vector[:3], vector[3:], axis)
 
     @classmethod
     def none(cls) -> Calibration:

@@ -143,7 +143,8 @@ class SlamMemory:
         trusted = np.where(np.isnan(trusted), UNKNOWN, trusted)
         trusted[contradicting] = 0.0
         noise = Noise(*labels.noise.tolist())
-        calibration = Calibration.of(labels.calibration) if len(labels.calibration) else None
+        axis = labels.bias_axis if len(labels.bias_axis) else None
+        calibration = Calibration.of(labels.calibration, axis) if len(labels.calibration) else None
         found = solved_from(Labelled(trusted, noise, calibration, labels.by_places), graph, networks, body_from_world)
         estimate = estimate_of(found.published)
         told = estimate.body_from_world, estimate.outlier_score, estimate.variance
@@ -158,7 +159,10 @@ class SlamMemory:
     @property
     def labels(self) -> KeptLabels | None:
         """The input of :meth:`of_labels`; None if odometry's position has jumped, which labels do not state."""
-        poses, calibration = self.poses, np.zeros(0) if self.calibration is None else self.calibration.vector
+        poses, calibration, axis = self.poses, np.zeros(0), np.zeros(0)
+        if self.calibration is not None:
+            calibration = self.calibration.vector
+            axis = axis if self.calibration.axis is None else self.calibration.axis
         places, noise = np.zeros((0, len(self.trusted)), np.float32), np.zeros(0)
         if poses is not None:
             if poses.pose.problem.jump is not None:
@@ -168,7 +172,8 @@ class SlamMemory:
         unexplained = self.unexplained if self.ahead is None else self.with_all_unexplained().unexplained
         search = np.array([self.searched, unexplained, self.is_divided], dtype=np.float64)
         graph = as_closures(self.graph, self.links)
-        kept = KeptLabels(graph, self.trusted, np.array(astuple(self.noise)), calibration, places, noise, search)
+        own = np.array(astuple(self.noise))
+        kept = KeptLabels(graph, self.trusted, own, calibration, axis, places, noise, search)
         return kept if self.copies is None else self.copies.labels_of_all(kept)
 
     @property
