@@ -21,9 +21,9 @@ from rotavg_ros.online.measurements import (
     KeyframeReference,
     OdometryMessage,
     RejectReason,
-    plain_number,
     plain_numbers,
     whole_nanoseconds,
+    whole_number,
 )
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.quaternion import IDENTITY, Quaternion
@@ -127,6 +127,9 @@ class OnlineEstimator:
 
         Returns:
             why it was refused and counted; None if it was taken, may wait, or is meant for another graph.
+
+        Raises:
+            UserError: an id or a stamp is no whole number.
         """
         with self._lock:
             if generation not in (None, self._current.generation):
@@ -165,8 +168,9 @@ class OnlineEstimator:
 
         Raises:
             ViewGraphError: not an :class:`EdgeLabel`; a file with such a label could never be loaded.
+            UserError: ``edge_id`` is no whole number.
         """
-        edge_id = plain_number(edge_id)
+        edge_id = whole_number("edge_id", edge_id)
         try:
             label = EdgeLabel(label)
         except ValueError:

@@ -209,9 +209,16 @@ def checked_stamp(stamp_ns: int) -> int:
     return stamp_ns
 
 
-def plain_number(number: Any) -> Any:
-    """Convert a NumPy number to Python's own, since JSON cannot represent it."""
-    return number.item() if hasattr(number, "item") else number
+def whole_number(name: str, number: Any) -> int:
+    """A number as Python's own integer, since JSON cannot represent NumPy's.
+
+    Raises:
+        UserError: it is no whole number; one that is cut to a whole one would be another keyframe's, or another edge's.
+    """
+    try:
+        return operator.index(number)
+    except TypeError:
+        raise UserError(f"{name} is {number!r}; give a whole number, such as int({name})") from None
 
 
 def whole_nanoseconds(stamp: Any) -> int:
@@ -227,14 +234,17 @@ def whole_nanoseconds(stamp: Any) -> int:
 
 
 def plain_numbers(numbers: Sequence[float] | None) -> tuple[float, ...] | None:
-    """The same for several numbers; a tuple, unlike an array, can be tested for truth."""
+    """Several numbers as Python's own; a tuple, unlike an array, can be tested for truth."""
     return None if numbers is None else tuple(map(float, numbers))
 
 
 def _plain_end(end: KeyframeReference) -> KeyframeReference:
-    if not (hasattr(end.keyframe_id, "item") or hasattr(end.stamp_ns, "item")):
-        return end
-    return KeyframeReference(end.robot, plain_number(end.keyframe_id), plain_number(end.stamp_ns))
+    """An end with Python's own integers; raises UserError if a number is no whole one."""
+    return KeyframeReference(
+        end.robot,
+        None if end.keyframe_id is None else whole_number("keyframe_id", end.keyframe_id),
+        None if end.stamp_ns is None else whole_nanoseconds(end.stamp_ns),
+    )
 
 
 def checked_edge(edge: EdgeMeasurement) -> EdgeMeasurement:
@@ -245,28 +255,30 @@ def checked_edge(edge: EdgeMeasurement) -> EdgeMeasurement:
 
     Raises:
         RejectedInputError: with the first reason that applies.
+        UserError: an id or a stamp is no whole number.
     """
+    edge_id, source, target = whole_number("edge_id", edge.edge_id), _plain_end(edge.source), _plain_end(edge.target)
     if edge.kind not in (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE):
         raise RejectedInputError(RejectReason.BAD_KIND)
     if not (math.isfinite(edge.precision) and edge.precision >= 0):
         raise RejectedInputError(RejectReason.BAD_PRECISION)
-    for reference in (edge.source, edge.target):
+    for reference in (source, target):
         if reference.keyframe_id is None and reference.stamp_ns is None:
             raise RejectedInputError(RejectReason.BAD_REFERENCE)
         if reference.keyframe_id is not None and not 0 <= reference.keyframe_id <= MAX_ID:
             raise RejectedInputError(RejectReason.ID_OUT_OF_RANGE)
         if reference.stamp_ns is not None:
             checked_stamp(reference.stamp_ns)
-    if not 0 <= edge.edge_id <= MAX_ID:
+    if not 0 <= edge_id <= MAX_ID:
         raise RejectedInputError(RejectReason.ID_OUT_OF_RANGE)
-    if edge.source.key == edge.target.key:
+    if source.key == target.key:
         raise RejectedInputError(RejectReason.SELF_EDGE)
     check_length(edge.translation, 3)
     return replace(
         edge,
-        edge_id=plain_number(edge.edge_id),
-        source=_plain_end(edge.source),
-        target=_plain_end(edge.target),
+        edge_id=edge_id,
+        source=source,
+        target=target,
         target_from_source=checked_rotation(edge.target_from_source),
         kind=int(edge.kind),
         precision=float(edge.precision),

@@ -265,3 +265,24 @@ def test_seconds_are_no_stamps() -> None:
         with pytest.raises(UserError, match="whole nanoseconds"):
             online.add_odometry("r", stamp, [0.0, 0.0, 0.0, 1.0])  # type: ignore[arg-type]
     assert online.add_odometry("r", 0, [0.0, 0.0, 0.0, 1.0]) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"edge_id": 1.0}, "edge_id is 1.0; give a whole number"),
+        ({"edge_id": "1"}, "edge_id is '1'; give a whole number"),
+        ({"source": KeyframeReference("r", 1.5)}, "keyframe_id is 1.5; give a whole number"),  # type: ignore[arg-type]
+        ({"target": KeyframeReference("r", stamp_ns=2.5)}, "stamp_ns is 2.5; give whole nano"),  # type: ignore[arg-type]
+    ],
+)
+def test_an_edge_with_broken_numbers_is_an_error(change: dict, message: str) -> None:
+    """A keyframe 1.5 had become a second keyframe 1, and the state's file could not be loaded."""
+    online = OnlineEstimator(replace(OPTIONS, unknown_keyframes="create"))
+    edge = EdgeMeasurement(1, KeyframeReference("r", 1), KeyframeReference("r", 2), (0.0, 0.0, 0.0, 1.0))
+    with pytest.raises(UserError, match=message):
+        online.add_edge(replace(edge, **change))
+    assert online.counts().keyframes == 0
+    assert online.add_edge(edge) is None
+    with pytest.raises(UserError, match=r"edge_id is 1\.5; give a whole number"):
+        online.label_edge("r", 1.5, EdgeLabel.REJECTED)  # type: ignore[arg-type]
