@@ -126,20 +126,22 @@ def dead_reckoning(
 
     Args:
         world_from_body: ``(K, 4)`` xyzw, the orientations to use.
-        odometry_world_from_body: ``(K, 4)`` xyzw, odometry's own.
-        odometry_position: ``(K, 3)`` metres in odometry's frame.
+        odometry_world_from_body: ``(K, 4)`` xyzw, odometry's own; NaN where unknown.
+        odometry_position: ``(K, 3)`` metres in odometry's frame; NaN likewise.
         chain: ``(K,)`` number of the odometry chain; the step from one chain to the next is unknown and taken as zero.
 
     Returns:
-        ``(K, 3)`` metres; the first position is odometry's.
+        ``(K, 3)`` metres; the first known position is odometry's. NaN where odometry's pose is unknown.
     """
-    if len(odometry_position) < 2:
-        return odometry_position
+    known = np.asarray(np.isfinite(np.hstack((odometry_world_from_body, odometry_position))).all(axis=1))
+    position = np.where(known[:, None], odometry_position, np.nan)
+    if known.sum() < 2:
+        return position
     from scipy.spatial.transform import Rotation
 
-    world_from_odometry = Rotation.from_quat(world_from_body) * Rotation.from_quat(odometry_world_from_body).inv()
-    steps = world_from_odometry[:-1].apply(np.diff(odometry_position, axis=0))
+    corrected, own = (Rotation.from_quat(turns[known]) for turns in (world_from_body, odometry_world_from_body))
+    steps = (corrected * own.inv())[:-1].apply(np.diff(odometry_position[known], axis=0))
     if chain is not None:
-        steps[np.diff(chain) != 0] = 0.0
-    position: NDArray[np.float64] = np.cumsum(np.vstack((odometry_position[:1], steps)), axis=0)
+        steps[np.diff(chain[known]) != 0] = 0.0
+    position[known] = np.cumsum(np.vstack((odometry_position[known][:1], steps)), axis=0)
     return position

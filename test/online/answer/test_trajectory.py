@@ -1,9 +1,14 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from rotavg_ros.online import EstimatorOptions, OnlineEstimator
 from rotavg_ros.online.answer.trajectory import dead_reckoning
+
+from ..drives import final
 
 
 def test_a_square_that_odometry_bends_is_square_again():
@@ -25,3 +30,33 @@ def test_positions_that_are_not_known_stay_unknown():
     orientation = np.tile([0, 0, 0, 1.0], (3, 1))
     assert np.isnan(dead_reckoning(orientation, orientation, np.full((3, 3), np.nan))).all()
     assert len(dead_reckoning(orientation[:1], orientation[:1], np.zeros((1, 3)))) == 1
+
+
+def test_positions_go_on_after_some_that_are_not_known() -> None:
+    """All that followed had been unknown."""
+    orientation = np.tile([0, 0, 0, 1.0], (5, 1))
+    turned = Rotation.from_euler("z", 90, degrees=True).as_quat()
+    odometry = np.array([[2, 0, 0], [3, 0, 0], [np.nan] * 3, [7, 0, 0], [8, 0, 0]], dtype=float)
+    expected = np.array([[2, 0, 0], [2, 1, 0], [np.nan] * 3, [2, 5, 0], [2, 6, 0]])
+    np.testing.assert_allclose(dead_reckoning(np.tile(turned, (5, 1)), orientation, odometry), expected, atol=1e-12)
+    unknown = np.where(np.isnan(odometry).any(axis=1)[:, None], np.nan, orientation)
+    np.testing.assert_allclose(dead_reckoning(np.tile(turned, (5, 1)), unknown, odometry), expected, atol=1e-12)
+    chain = np.array([0, 0, 0, 1, 1])
+    expected[3:, 1] -= 4
+    np.testing.assert_allclose(
+        dead_reckoning(np.tile(turned, (5, 1)), orientation, odometry, chain), expected, atol=1e-12
+    )
+
+
+def test_a_tracker_that_finds_its_position_again_goes_on_there(solver) -> None:
+    """Its keyframes from then on had begun at the origin, 32 m away."""
+    online = OnlineEstimator(EstimatorOptions(keyframe_distance=0.5), solver)
+    for message in range(300):
+        second, place = 0.1 * message, (10 + 0.1 * message, 0.0, 0.0)
+        turn = (0.0, 0.0, math.sin(0.02 * second), math.cos(0.02 * second))
+        online.add_odometry("r", 100_000_000 * message, turn, (math.nan,) * 3 if 10 < second < 20 else place)
+    poses = online.trajectories(final(online))["r"]
+    known = np.isfinite(poses.odometry_position).all(axis=1)
+    assert (poses.stamp_ns[known] > 20_000_000_000).sum() > 10
+    for positions in (poses.position, poses.position_dead_reckoned):
+        np.testing.assert_allclose(positions[known], poses.odometry_position[known], atol=1e-9)
