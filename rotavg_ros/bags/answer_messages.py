@@ -73,10 +73,11 @@ def orientation_message(stamp_ns: int, world_from_body: Quaternion, frame_id: st
 
 
 def path_message(trajectory: Trajectory, frame_id: str) -> Any:
-    """A ``nav_msgs/msg/Path`` with its poses in bulk; the origin where positions are not known."""
-    stamp = np.stack(np.divmod(trajectory.stamp_ns, NANOSECONDS), axis=1)
+    """A ``nav_msgs/msg/Path`` with its poses in bulk; the origin where no position is known."""
+    rows = trajectory.on_path
+    stamp = np.stack(np.divmod(trajectory.stamp_ns[rows], NANOSECONDS), axis=1)
     stamp[(stamp[:, 0] < 0) | (stamp[:, 0] >= _END_OF_TIME_S)] = 0
-    pose = np.concatenate((np.nan_to_num(trajectory.position), trajectory.world_from_body), axis=1)
+    pose = np.concatenate((np.nan_to_num(trajectory.position), trajectory.world_from_body), axis=1)[rows]
     poses = StampedPoses(stamp, frame_id, pose)
     newest = int(trajectory.stamp_ns[-1]) if len(trajectory.stamp_ns) else 0
     return _make(PATH, header=_header(newest, frame_id), poses=poses)

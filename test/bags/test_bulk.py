@@ -21,12 +21,13 @@ def types(*names: str) -> list[Any]:
 
 
 @settings(deadline=None, max_examples=40)
-@given(count=st.integers(0, 4), frame=FRAMES, seed=st.integers(0, 100))
-def test_a_path(count: int, frame: str, seed: int) -> None:
+@given(count=st.integers(0, 4), frame=FRAMES, seed=st.integers(0, 100), lost=st.integers(0, 5))
+def test_a_path(count: int, frame: str, seed: int, lost: int) -> None:
     rng = np.random.default_rng(seed)
     stamps = np.sort(rng.integers(-5, 2**61, count))  # before time begins, and after it ends
     numbers = rng.normal(size=(count, 7))
     unused = np.zeros(count, dtype=np.int64)
+    numbers[:lost, :3] = np.nan
     trajectory = Trajectory(
         unused, stamps, unused, numbers[:, 3:], numbers[:, :3], numbers[:, :3], numbers[:, 3:], numbers[:, :3]
     )
@@ -36,7 +37,8 @@ def test_a_path(count: int, frame: str, seed: int) -> None:
         *("geometry_msgs/msg/Pose", "geometry_msgs/msg/Point", "geometry_msgs/msg/Quaternion"),
     )
     poses = []
-    for stamp, row in zip(stamps.tolist(), numbers.tolist(), strict=True):
+    shown = slice(lost if lost < count else 0, None)  # all, at the origin, where no position is known
+    for stamp, row in zip(stamps[shown].tolist(), np.nan_to_num(numbers)[shown].tolist(), strict=True):
         at = divmod(stamp, 10**9) if 0 <= stamp < 2**31 * 10**9 else (0, 0)
         poses.append(stamped(header(time(*at), frame), pose(point(*row[:3]), quaternion(*row[3:]))))
     expected = typestore().types["nav_msgs/msg/Path"](header=message.header, poses=poses)

@@ -36,6 +36,12 @@ class Trajectory:
     odometry_world_from_body: NDArray[np.float64]
     odometry_position: NDArray[np.float64]
 
+    @property
+    def on_path(self) -> NDArray[np.int64]:
+        """Rows of a path: keyframes of known position; all of them, at the origin, where no position is known."""
+        known = np.flatnonzero(np.isfinite(self.position).all(axis=1))
+        return known if len(known) else np.arange(len(self.node))
+
 
 def corrected_trajectories(answer: Answer, odometry_of: Mapping[str, OdometrySamples]) -> dict[str, Trajectory]:
     """Poses of every robot's keyframes that have a stamp.

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from rotavg_ros import rotations
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.growing_array import GrowingArray
 from rotavg_ros.online.measurements import RejectedInputError, RejectReason
@@ -197,7 +199,7 @@ class OdometrySamples:
         gap = int(stamps[after] - stamps[before])
         share = min(max((stamp_ns - int(stamps[before])) / gap, 0.0), 1.0) if gap else 1.0
         if share < 1 and self._chain.view[before] != self._chain.view[after]:
-            share = 0.0
+            after, share = before, 1.0
         x, y, z = (
             positions[after] if share == 1 else (1 - share) * positions[before] + share * positions[after]
         ).tolist()
@@ -212,15 +214,37 @@ class OdometrySamples:
     def poses_at(
         self, stamp_ns: NDArray[np.int64], time_line: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-        """The messages at or next after the moments ``(K,)``.
+        """What :meth:`world_from_body_at` and :meth:`position_at` say of the moments ``(K,)``.
 
         Returns:
-            world_from_body ``(K, 4)``, position ``(K, 3)`` and number of the chain ``(K,)``.
+            world_from_body ``(K, 4)``, position ``(K, 3)`` and number of the chain ``(K,)``; NaN and -1 where
+            :meth:`world_from_body_at` refuses.
 
         Positions are NaN where the odometry carries none. There must be a message.
         """
-        rows = self._rows_from(stamp_ns, time_line)
-        return self._world_from_body.view[rows], self._position.view[rows], self._chain.view[rows]
+        stamps, chains, tolerance_ns = self._stamp_ns.view, self._chain.view, self.bounds.tolerance_ns
+        after = self._rows_from(stamp_ns, time_line)
+        before = np.maximum(after - 1, 0)
+        before = np.where(self._time_line.view[before] == self._time_line.view[after], before, after)
+        since, until = stamp_ns - stamps[before], stamps[after] - stamp_ns
+        is_between = (since > 0) & (until > 0)
+        is_seam = is_between & (chains[before] != chains[after])
+        is_gap = is_between & ~is_seam & (since + until > self.bounds.max_gap_ns) & ~self._stood_still.view[after]
+        # How far the moment is from the message whose rotation it would take; 0 where it is interpolated.
+        off = np.select([is_seam, is_gap, is_between], [since, np.minimum(since, until), 0], np.abs(until))
+        is_known = off <= tolerance_ns
+        nearest = np.where(is_seam | (is_gap & (since <= until)), before, after)
+        turns, places = self._world_from_body.view[nearest], self._position.view[nearest]
+        is_inner = is_between & ~is_seam
+        first, second = before[is_inner], after[is_inner]
+        share = since[is_inner] / (since + until)[is_inner]
+        one, other = (torch.from_numpy(self._world_from_body.view[rows]) for rows in (first, second))
+        inner = rotations.normalize(rotations.slerp(one, other, torch.from_numpy(share))).numpy()
+        turns[is_inner] = np.where(is_gap[is_inner, None], turns[is_inner], inner)
+        one, other = self._position.view[first], self._position.view[second]
+        places[is_inner] = one + share[:, None] * (other - one)
+        turns[~is_known] = places[~is_known] = np.nan
+        return turns, places, np.where(is_known, chains[np.where(is_between, before, after)], -1)
 
     def first_body_from_world(self) -> Quaternion:
         """Inverse of the first message's rotation."""

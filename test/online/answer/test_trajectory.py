@@ -3,10 +3,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.online import EstimatorOptions, OnlineEstimator
+from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
 from rotavg_ros.online.answer.trajectory import dead_reckoning
+from rotavg_ros.view_graph import EdgeKind
 
 from ..drives import final
 
@@ -60,3 +62,32 @@ def test_a_tracker_that_finds_its_position_again_goes_on_there(solver) -> None:
     assert (poses.stamp_ns[known] > 20_000_000_000).sum() > 10
     for positions in (poses.position, poses.position_dead_reckoned):
         np.testing.assert_allclose(positions[known], poses.odometry_position[known], atol=1e-9)
+
+
+def test_keyframes_between_two_messages_are_placed_between_them(solver) -> None:
+    """The next message's pose had been taken: 14°, and half a metre, off; where odometry had ended, it stood still."""
+    online = OnlineEstimator(EstimatorOptions(keyframe_source="edges"), solver)
+
+    def circle(second: np.ndarray) -> tuple[Rotation, np.ndarray]:
+        heading = 0.5 * second
+        place = np.stack((np.sin(heading), 1 - np.cos(heading), 0 * heading), axis=-1) / 0.5
+        return Rotation.from_euler("z", heading[..., None]), place
+
+    messages, keyframes = np.arange(0, 20, 0.5), np.arange(0.1, 40, 0.7)
+    for second, turn, place in zip(messages, *circle(messages), strict=True):
+        online.add_odometry("r", round(1e9 * second), turn.as_quat(), place)
+    turn = circle(keyframes)[0]
+    steps = turn[1:].inv() * turn[:-1]
+    ends = [KeyframeReference("r", number, round(1e9 * second)) for number, second in enumerate(keyframes.tolist())]
+    for number, step in enumerate(steps.as_quat()):
+        edge = EdgeMeasurement(number, ends[number], ends[number + 1], step, EdgeKind.ODOMETRY)
+        assert online.add_edge(edge) is None
+    poses = online.trajectories(final(online))["r"]
+    is_reached = keyframes < messages[-1] + online.options.stamp_tolerance_s
+    off = poses.odometry_position - circle(keyframes)[1]
+    assert np.linalg.norm(off[is_reached], axis=1).max() < 0.02
+    assert np.isnan(off[~is_reached]).all() and np.isnan(poses.position[~is_reached]).all()
+    assert np.linalg.norm(np.diff(poses.position[is_reached], axis=0), axis=1) == pytest.approx(0.7, abs=0.02)
+    turned = Rotation.from_quat(poses.odometry_world_from_body[is_reached]).inv() * turn[is_reached]
+    assert turned.magnitude().max() < 1e-6
+    np.testing.assert_array_equal(poses.on_path, np.flatnonzero(np.isfinite(poses.position[:, 0])))

@@ -6,6 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online.measurements import RejectedInputError
 from rotavg_ros.online.odometry.continuity import OdometrySample
@@ -76,3 +79,29 @@ def test_moments_at_which_the_robot_stood_still_are_known_though_messages_were_t
 def test_a_pause_of_odometry_stays_a_gap_where_messages_are_thinned_out() -> None:
     off = off_deg(thinned_out(pauses=(100.0, 104.0)), np.array([80.0, 102.0, 200.0]))
     assert np.isnan(off).tolist() == [False, True, False]
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_many_poses_are_those_of_each_moment(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    samples = OdometrySamples(OdometryBounds(*(int(random.integers(*ends)) for ends in ((0, 8), (5, 40), (8, 60)))))
+    chain = time_line = 0
+    stamp, turn = int(random.integers(50)), Rotation.random(random_state=random)
+    for _ in range(int(random.integers(1, 60))):
+        place = None if random.random() < 0.1 else tuple(random.normal(0, 5, 3).tolist())
+        x, y, z, w = turn.as_quat(canonical=True).tolist()
+        samples.append(OdometrySample(stamp, (x, y, z, w), place), chain, time_line)
+        begins, goes_back = random.random(2) < (0.1, 0.05)
+        chain, time_line = chain + (begins or goes_back), time_line + goes_back
+        stamp = int(random.integers(50)) if goes_back else stamp + int(random.integers(1, 30))
+        turn *= Rotation.from_rotvec(random.normal(0, 0.6, 3) * (random.random() < 0.7))
+    stamps = np.append(random.choice(samples.stamps_ns, 10), random.integers(-20, samples.stamps_ns.max() + 50, 50))
+    lines = random.integers(0, samples.last_time_line + 1, 60)
+    for at, line, *found in zip(stamps.tolist(), lines.tolist(), *samples.poses_at(stamps, lines), strict=True):
+        try:
+            expected = samples.world_from_body_at(at, line), samples.position_at(at, line), samples.chain_at(at, line)
+        except RejectedInputError:
+            expected = (math.nan,) * 4, (math.nan,) * 3, -1
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)

@@ -17,12 +17,11 @@ from rotavg_ros.ros.node.output.conversions import to_quaternion_message, to_tim
 
 def path_message(trajectory: Trajectory, frame_id: str) -> Path:
     """Corrected keyframe poses; the origin where the odometry carries no positions."""
-    positions = np.nan_to_num(trajectory.position).tolist()
+    rows = trajectory.on_path
+    columns = trajectory.stamp_ns, np.nan_to_num(trajectory.position), trajectory.world_from_body
     poses = [
         PoseStamped(header=Header(stamp=to_time(stamp_ns), frame_id=frame_id), pose=_pose(position, orientation))
-        for stamp_ns, position, orientation in zip(
-            trajectory.stamp_ns.tolist(), positions, trajectory.world_from_body.tolist(), strict=True
-        )
+        for stamp_ns, position, orientation in zip(*(column[rows].tolist() for column in columns), strict=True)
     ]
     newest = int(trajectory.stamp_ns[-1]) if len(trajectory.stamp_ns) else 0
     return Path(header=Header(stamp=to_time(newest), frame_id=frame_id), poses=poses)
