@@ -30,17 +30,18 @@ class LastAnswer:
         component: Tensor | None = None,
         outlier: NDArray[np.bool_] | None = None,
         queued: NDArray[np.bool_] | None = None,
+        known: Known | None = None,
     ) -> None:
         """Begin with what is known.
 
         Args:
-            body_from_world, component, outlier: see above.
+            body_from_world, component, outlier, known: see above.
             queued: ``(M,)`` closures of the graph that wait; the other edges have entered.
         """
         self.body_from_world = body_from_world
         self.component = component
         self.outlier: NDArray[np.bool_] = np.zeros(0, dtype=bool) if outlier is None else outlier
-        self.known = None if body_from_world is None else Known.of_orientations(body_from_world)
+        self.known = known
         self.queue = ClosureQueue() if queued is None else ClosureQueue(queued)
         self.waited = self.queue.waits
         self._since_problem: Renumbering | None = None

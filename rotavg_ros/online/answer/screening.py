@@ -86,10 +86,15 @@ class Known:
         )
 
     @classmethod
-    def of_orientations(cls, body_from_world: Tensor) -> Known:
-        """From orientations ``(n, 4)`` alone, all that a state file keeps of an answer; all are one component."""
+    def of_orientations(cls, body_from_world: Tensor, solved: ViewGraph) -> Known:
+        """From orientations ``(n, 4)`` alone, all that a state file keeps of an answer.
+
+        Args:
+            body_from_world: of the first n nodes.
+            solved: graph of the edges that it was an answer to.
+        """
         nothing = torch.zeros(len(body_from_world), dtype=torch.float64)
-        return cls(body_from_world, nothing, nothing.long())
+        return cls(body_from_world, nothing, solved.components()[: len(body_from_world)])
 
     def of_keyframes(self, nodes: Callable[[Tensor], Tensor]) -> Known:
         """The same for the keyframes that a compaction has left; ``nodes`` selects their rows."""

@@ -16,6 +16,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.online.answer.anchoring import corrections
 from rotavg_ros.online.answer.gauge import is_numbered_by_first_node
 from rotavg_ros.online.answer.last_answer import LastAnswer
+from rotavg_ros.online.answer.screening import Known
 from rotavg_ros.online.compaction.marginalized_keyframes import Forgotten, MarginalizedIndex, MarginalizedKeyframes
 from rotavg_ros.online.content import ContentState
 from rotavg_ros.online.graph.builder import GraphBuilder
@@ -148,9 +149,12 @@ def _restore(arrays: Arrays, header: dict[str, Any], options: EstimatorOptions) 
     component = torch.from_numpy(arrays["component"])
     if len(component) not in {0, len(answered)} or not is_numbered_by_first_node(component):
         raise ValueError("components of other keyframes")
-    memory = _kept_labels(_with_prefix(_LABELS, arrays), graph.snapshot().graph, queued)
-    known = component if len(component) and memory is not None else None
-    last = LastAnswer(answered if len(answered) else None, known, arrays["outlier"], queued)
+    view_graph = graph.snapshot().graph
+    memory = _kept_labels(_with_prefix(_LABELS, arrays), view_graph, queued)
+    goes_on_from = component if len(component) and memory is not None else None
+    solved = torch.from_numpy(np.flatnonzero(~queued[: len(arrays["outlier"])]))
+    told = Known.of_orientations(answered, view_graph.select_edges(solved)) if len(answered) else None
+    last = LastAnswer(answered if len(answered) else None, goes_on_from, arrays["outlier"], queued, told)
     growth = Growth(
         options,
         last,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -207,3 +209,25 @@ def test_what_the_streams_above_reach(solver, tmp_path) -> None:
     assert counts.marginalized > 0 and counts.time_jumps == 1 and counts.pending > 0
     assert len(state["odometry0_stamp_ns"]) < 60 and len(state["odometry0_refused_stamp_ns"]) == 1
     assert state["backward_jumps"]["runs"]["b"] and state["outlier"].any()
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_closures_that_join_two_robots_are_not_judged_by_how_these_lay(solver, tmp_path: Path, restart: bool) -> None:
+    """After a load the robots had counted as joined: all closures between them were flagged, and none was solved."""
+    online = OnlineEstimator(EstimatorOptions(keyframe_source="edges"), solver)
+    ends = {robot: [KeyframeReference(robot, number) for number in range(100)] for robot in "ab"}
+    for robot in "ab":
+        for number, (before, after) in enumerate(itertools.pairwise(ends[robot])):
+            online.add_edge(EdgeMeasurement(number, before, after, (0.0, 0.0, 0.6, 0.8), EdgeKind.ODOMETRY))
+    online.tick()
+    if restart:
+        online.save(tmp_path / "state.npz")
+        online = OnlineEstimator(online.options, solver)
+        online.load(tmp_path / "state.npz")
+    step, between = Rotation.from_quat([0.0, 0.0, 0.6, 0.8]), Rotation.from_rotvec([2, 0, 0])
+    for number, (one, other) in enumerate(itertools.product(range(20), range(20))):
+        seen = step**other * between * step**-one
+        online.add_edge(EdgeMeasurement(number, ends["a"][one], ends["b"][other], seen.as_quat()))
+    answer = online.tick()
+    assert answer is not None and answer.waits.any()
+    assert answer.num_components == 1 and not answer.outlier.any()
