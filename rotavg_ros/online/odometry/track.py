@@ -192,7 +192,7 @@ class OdometryTrack:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Everything as arrays, for :meth:`from_arrays`."""
-        anchors, at = np.array(self.anchors, dtype=np.float64).reshape(-1, 4), self._clock_went_back_at
+        anchors = np.array(self.anchors, dtype=np.float64).reshape(-1, 4)
         return (
             self.samples.arrays()
             | self._continuity.arrays()
@@ -200,7 +200,8 @@ class OdometryTrack:
                 "num_keyframes": np.array(self.num_keyframes),
                 "anchors": anchors,
                 "begins_time_line": np.array(self._begins_time_line),
-                "clock_went_back_at": np.array([] if at is None else [at], dtype=np.int64),
+                "clock_went_back_at": _stamp_or_none(self._clock_went_back_at),
+                "without_position_since": _stamp_or_none(self._without_position_since),
             }
         )
 
@@ -215,9 +216,17 @@ class OdometryTrack:
         track.num_keyframes = int(arrays["num_keyframes"])
         track.anchors = [(x, y, z, w) for x, y, z, w in arrays["anchors"].tolist()]
         track._begins_time_line = bool(arrays["begins_time_line"])
-        # Files of earlier versions do not have it.
-        track._clock_went_back_at = next(iter(arrays.get("clock_went_back_at", np.empty(0)).tolist()), None)
+        # Files of earlier versions do not have these two.
+        track._clock_went_back_at, track._without_position_since = (
+            next(iter(arrays.get(name, np.empty(0)).tolist()), None)
+            for name in ("clock_went_back_at", "without_position_since")
+        )
         track._before_latest, track.latest, track.last_keyframe = samples.latest_of_chain()
         track.chain, track.time_line = samples.last_chain, samples.last_time_line
         track._is_restored = track.latest is not None
         return track
+
+
+def _stamp_or_none(stamp_ns: int | None) -> NDArray[np.int64]:
+    """A stamp as an array of one, None as one of none."""
+    return np.array([] if stamp_ns is None else [stamp_ns], dtype=np.int64)

@@ -50,7 +50,7 @@ def test_distance_counts_only_with_positions():
         assert not track.reached(policy)
 
 
-def _keyframes(positions: list) -> list[int]:
+def _keyframes(positions: list, restarts: bool = False) -> list[int]:
     """Stamps of those chosen of messages 10 ns apart that turn by 6° each; every 10° makes one."""
     track, chosen = OdometryTrack(BOUNDS), []
     for index, position in enumerate(positions):
@@ -58,6 +58,8 @@ def _keyframes(positions: list) -> list[int]:
         if track.reached(KeyframePolicy(math.radians(10), 0, 0)):
             track.mark_keyframe()
             chosen.append(10 * index)
+        if restarts:
+            track = OdometryTrack.from_arrays(BOUNDS, track.arrays())
     return chosen
 
 
@@ -77,6 +79,7 @@ HERE, LOST = (1.0, 2.0, 3.0), (math.nan, math.nan, math.nan)
 )
 def test_a_message_whose_position_is_lost_waits_for_one_that_has_it(positions: list, expected: list[int]) -> None:
     assert _keyframes(positions) == expected
+    assert _keyframes(positions, restarts=True) == expected  # it had waited anew after each
 
 
 @pytest.mark.parametrize(
