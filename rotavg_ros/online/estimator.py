@@ -283,7 +283,7 @@ class OnlineEstimator:
         with self._lock:
             self._current.forget()
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write everything into one file, whole or not at all.
 
         Raises:
@@ -291,15 +291,15 @@ class OnlineEstimator:
         """
         with self._lock:
             state = state_content.collect(self._content.state)
-        state_file.write(path, state.encoded())
+        state_file.write(Path(path), state.encoded())
 
-    def load(self, path: Path) -> None:
+    def load(self, path: str | Path) -> None:
         """Replace everything by a file's content.
 
         Raises:
             StateFileError: not a state file, or not a whole one. The old state is kept.
         """
-        state = state_content.restore(state_file.read(path), self.options)
+        state = state_content.restore(state_file.read(Path(path)), self.options)
         with self._lock:
             state.version = max(state.version, self._content.version)
             self._current.replace(state)

@@ -273,3 +273,11 @@ def test_options_may_differ_after_the_restart(filled, solver, tmp_path):
     other.load(tmp_path / "state.npz")
     assert other.counts().keyframes == filled.counts().keyframes
     assert other.tick() is not None
+
+
+def test_a_path_may_be_a_string(filled, solver, tmp_path) -> None:
+    path = str(tmp_path / "state.npz")
+    filled.save(path)
+    again = OnlineEstimator(OPTIONS, solver)
+    again.load(path)
+    assert again.counts() == filled.counts()
