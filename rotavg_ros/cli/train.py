@@ -156,12 +156,12 @@ def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Pa
     name = f"{config.family}-{network}"
     # Errors in any of the files, and what is in the folder, are noticed before the minutes that drawing graphs takes.
     weights = None if given.start is None else read_network(NETWORKS[name], given.start)
-    make_folder(output)
     inputs: dict[str, str] = {}
     before: CleanNet | None = None
     if network == "fine-net" and config.family != "slam":
         before = _clean_net(PaperCleanNet if config.family == "paper" else CleanNet, output, given.clean_net)
         inputs["clean_net_fingerprint"] = fingerprint(before)
+    make_folder(output)
     command = f"rotavg train {asked} {Path(given.config).stem if Path(given.config).exists() else given.config}"
     if given.clean_net is not None:
         command += " --clean-net WEIGHTS"

@@ -181,6 +181,7 @@ def test_mistakes_take_one_line(
     assert message in error
     assert error.startswith("rotavg: error: ")
     assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
