@@ -20,7 +20,8 @@ from rotavg_ros.online.odometry.track import OdometryTrack
 from rotavg_ros.online.quaternion import Quaternion, Vector
 from rotavg_ros.view_graph import EdgeKind
 
-# Largest x and y of a quaternion that counts as a rotation about z.
+# Largest x and y of a quaternion that counts as a rotation about z, and largest way along z that counts as none, as a
+# share of the longest step.
 _PLANAR = 1e-6
 
 
@@ -67,7 +68,8 @@ class OdometryFrame:
         keyframes_before: number of keyframes that the robot's odometry had made up to that one.
         steps: of odometry since that keyframe; None where odometry chooses the keyframes, and so counts them.
         drift: variances of poses derived from the frame.
-        is_planar: whether the robot has turned about the world's z axis only.
+        axis: of the world, about which alone the robot has turned, a unit vector; None if it has turned otherwise, too.
+        is_planar: whether there is such an axis, and the robot has moved across it only.
     """
 
     chain: int
@@ -77,6 +79,7 @@ class OdometryFrame:
     keyframes_before: int = 0
     steps: OdometrySteps | None = None
     drift: Drift = UNKNOWN_DRIFT
+    axis: Vector | None = None
     is_planar: bool = False
 
     @classmethod
@@ -128,7 +131,8 @@ def placed_frames(
         trajectories: of its keyframes.
         builder: its graph may have grown since.
     """
-    is_planar = bool((np.abs(answer.target_from_source[:, :2]) < _PLANAR).all())
+    turns_about_z = bool((np.abs(answer.target_from_source[:, :2]) < _PLANAR).all())
+    is_planar = turns_about_z and _moves_across_z(answer)
     step_variances = _step_variances(answer)
     chosen_by_front_end = builder.options.keyframe_source == "edges"
     found = {}
@@ -161,9 +165,22 @@ def placed_frames(
             keyframes_before=track.num_keyframes - _keyframes_since(builder, robot, moment),
             steps=steps,
             drift=Drift(deviation**2, place**2, *step_variances),
+            axis=_z_axis((x, y, z, w)) if turns_about_z else None,
             is_planar=is_planar,
         )
     return found
+
+
+def _moves_across_z(answer: Answer) -> bool:
+    """Whether no edge leads along the z axis of the bodies."""
+    lengths = np.abs(np.nan_to_num(answer.translation))
+    return bool(lengths[:, 2].max(initial=0.0) <= _PLANAR * lengths.max(initial=0.0))
+
+
+def _z_axis(world_from_body: Quaternion) -> Vector:
+    """The body's z axis in the world; components that are too small to be told from 0 are 0."""
+    x, y, z = (0.0 if abs(part) < _PLANAR else part for part in quaternion.rotate(world_from_body, (0.0, 0.0, 1.0)))
+    return (x, y, z)
 
 
 def _step_size(answer: Answer, robot: str) -> StepSize:

@@ -138,13 +138,16 @@ def covariance(frame: OdometryFrame, steps: int, odometry_position: Vector) -> N
         steps: number of odometry steps since the frame's keyframe.
         odometry_position: of the body in the odometry frame, metres.
 
-    For a robot that turns only about z, the variances of the other rotations and of the height are 0.
+    A robot that turns about its z axis alone does not err about the others; on a slope these are not the world's.
+    One that moves across its z axis alone does not err along it.
     """
     orientation, position = frame.variances_at(odometry_position, steps)
-    spread = np.array([position] * 3 + [orientation] * 3)
-    spread = np.where(np.isfinite(spread), spread, UNKNOWN_VARIANCE)
-    if frame.is_planar:
-        spread[2:5] = 0.0
-    flat = np.zeros(36)
-    flat[_DIAGONAL] = spread
-    return flat
+    turns = np.eye(3) if frame.axis is None else np.outer(frame.axis, frame.axis)
+    shifts = np.eye(3) - turns if frame.is_planar else np.eye(3)
+    spread = np.zeros((6, 6))
+    spread[:3, :3], spread[3:, 3:] = _known(position) * shifts, _known(orientation) * turns
+    return spread.ravel()
+
+
+def _known(variance: float) -> float:
+    return variance if math.isfinite(variance) else UNKNOWN_VARIANCE

@@ -18,6 +18,10 @@ from nav_msgs.msg import Odometry, Path
 from rotavg_msgs.msg import KeyframeReference, RelativeRotation
 from std_msgs.msg import Header
 
+from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, OnlineEstimator
+from rotavg_ros.online import KeyframeReference as Moment
+from rotavg_ros.ros.node.output.robot_poses import covariance
+
 pytestmark = pytest.mark.ros
 
 EVERY_MESSAGE = ("keyframe_angle_deg:=0.0", "keyframe_distance_m:=0.0", "solve_period_s:=0.1")
@@ -190,3 +194,37 @@ def test_a_correction_is_spread_over_time(live_node) -> None:
         moved += float(np.linalg.norm(at - carried))
         assert np.linalg.norm(at - carried) < 0.01 * elapsed + 1e-6
     assert moved > 0.05
+
+
+@pytest.mark.parametrize(("slope", "climb"), [(0.0, 0.0), (0.4, 0.0), (0.0, 0.1)], ids=["plain", "slope", "ramp"])
+def test_where_a_covariance_states_zero_there_is_no_error(slope: float, climb: float) -> None:
+    """A robot that turns about its own z axis alone: on a slope it errs about two of the world's axes."""
+    random = np.random.default_rng(1)
+    angle = 2 * math.pi * np.arange(LENGTH) / LAP
+    tilt = Rotation.from_euler("x", slope)
+    truth = tilt * Rotation.from_rotvec(np.outer(angle, [0, 0, 1]))
+    position = tilt.apply(np.stack((4 * np.cos(angle), 4 * np.sin(angle), climb * angle), axis=1))
+    estimator = OnlineEstimator(EstimatorOptions(keyframe_angle=0, keyframe_distance=0))
+    moved, at = truth[0], position[0]
+    for index in range(LENGTH):
+        if index:
+            off = Rotation.from_rotvec([0, 0, random.normal(0, 0.01)])
+            way = truth[index - 1].inv().apply(position[index] - position[index - 1])
+            at = at + moved.apply(way + random.normal(0, 0.01, 3) * [1, 1, climb > 0])
+            moved = moved * truth[index - 1].inv() * truth[index] * off
+        assert estimator.add_odometry("r", (1 + index) * 10**9, moved.as_quat(), at) is None
+    for target in range(LAP, LENGTH, 4):
+        ends = [Moment("r", stamp_ns=(1 + end) * 10**9) for end in (target - LAP, target)]
+        turn, way = truth[target - LAP].inv() * truth[target], position[target] - position[target - LAP]
+        way = truth[target - LAP].inv().apply(way)
+        assert estimator.add_edge(EdgeMeasurement.from_ros(target, *ends, turn.as_quat(), way)) is None
+    answer = estimator.tick()
+    path = estimator.place(answer)["r"]
+    turned = (Rotation.from_quat(path.world_from_body[-1]) * truth[-1].inv()).as_rotvec()
+    off = np.concatenate((path.position[-1] - position[-1], turned))
+    frame, steps = estimator.odometry_frame("r")
+    stated, axes = np.linalg.eigh(covariance(frame, steps, at).reshape(6, 6))
+    is_none = stated < 1e-9 * stated.max()
+    assert is_none.sum() == (2 if climb else 3)
+    assert np.abs(off @ axes[:, is_none]).max() < 1e-6
+    assert (np.abs(off @ axes[:, ~is_none]) < 5 * np.sqrt(stated[~is_none])).all()
