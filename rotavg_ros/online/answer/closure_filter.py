@@ -32,11 +32,13 @@ class Decision(Generic[_Item]):
         passed: items handed in with closures that are believed now, in the order in which they came.
         revoked: rows of the answer's edges that were let pass and are now judged false.
         reinstated: rows of edges that were revoked and are believed again.
+        shares_names: whether several closures of the answer have one name, and one of them, at least, was handed in.
     """
 
     passed: list[_Item] = field(default_factory=list)
     revoked: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     reinstated: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    shares_names: bool = False
 
 
 @dataclass
@@ -102,7 +104,9 @@ class ClosureFilter(Generic[_Item]):
 
     def knows(self, name: EdgeName) -> bool:
         """Whether a closure of this name waits or has passed."""
-        key = _key(name)
+        return self._knows(_key(name))
+
+    def _knows(self, key: int) -> bool:
         return key in self._waiting or key in self._believed
 
     def passes(self, name: EdgeName) -> bool:
@@ -121,8 +125,10 @@ class ClosureFilter(Generic[_Item]):
             is_false = outlier[np.append(first[1:], len(rows)) - 1]
         else:
             is_false = np.logical_or.reduceat(outlier, first)
+        is_shared = np.diff(np.append(first, len(rows))) > 1
+        shares_names = any(self._knows(key) for key in unique[is_shared].tolist())
         revoked, reinstated = self._follow(unique, is_false, rows[order], first)
-        return Decision(self._let_pass(unique, is_false, now - delay_s), revoked, reinstated)
+        return Decision(self._let_pass(unique, is_false, now - delay_s), revoked, reinstated, shares_names)
 
     def _let_pass(self, unique: NDArray[np.uint64], is_false: NDArray[np.bool_], until: float) -> list[_Item]:
         passed: list[_Item] = []

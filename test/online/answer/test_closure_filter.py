@@ -47,6 +47,15 @@ def test_what_is_believed_passes_once_and_in_order():
     assert len(closures) == 0
 
 
+def test_a_name_that_stands_for_several_closures_is_told_of_if_one_of_them_is_to_go_on():
+    """The others may have come from a sender whose closures nobody sends on."""
+    closures: ClosureFilter[str] = ClosureFilter()
+    closures.take(("a", 1), "it", now=0.0)
+    alone = [("a", 1, False), ("a", 2, False), ("a", 2, False), ("b", 1, False)]
+    assert not closures.decide(answer(alone), now=1.0, delay_s=0.0).shares_names
+    assert closures.decide(answer([*alone, ("a", 1, True)]), now=2.0, delay_s=0.0).shares_names
+
+
 def test_a_closure_that_is_not_solved_yet_does_not_pass_however_well_it_fits():
     closures: ClosureFilter[str] = ClosureFilter()
     closures.take(("a", 1), "it", now=0.0)

@@ -37,7 +37,7 @@ class Forward:
     Attributes:
         topic: the topic that edges come from.
         filter: the closures that wait, and those that have passed.
-        shares_names: whether different edges of one robot have come with the same id.
+        shares_names: whether different closures of one robot have the same id, those of other topics included.
     """
 
     def __init__(self, topic: str, output: Publisher) -> None:
@@ -256,7 +256,6 @@ class Forwarding:
                 if forward.filter.waits(name, measurement):  # the estimator may have given it up meanwhile
                     return
                 is_known = forward.filter.knows(name)
-                forward.shares_names |= is_known and refusal is None
                 if not is_known or refusal is None:
                     forward.filter.take(name, record.element, time.monotonic(), measurement)
                 return
@@ -280,6 +279,7 @@ class Forwarding:
 
     def _send(self, forward: Forward, answer: Answer) -> None:
         decision = forward.filter.decide(answer, time.monotonic(), self._delay_s)
+        forward.shares_names |= decision.shares_names
         for name, rows in (("revoked", decision.revoked), ("reinstated", decision.reinstated)):
             if len(rows):
                 self._verdicts[name].publish(flags_message(answer, self._frame_id, rows))

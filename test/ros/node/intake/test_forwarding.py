@@ -142,13 +142,18 @@ def test_arrays_and_a_delay(live_node) -> None:
 
 
 @pytest.mark.large
-def test_closures_that_share_an_id_are_told_of(live_node) -> None:
+@pytest.mark.parametrize("topics", [1, 2])
+def test_closures_that_share_an_id_are_told_of(live_node, topics: int) -> None:
+    """On one topic, or on one that is sent on and another that is not: both count from 0."""
     listen(live_node, RelativeRotation, "/trusted")
     start(live_node, "forward_topics:=['relative_rotations:trusted']")
-    for edge_id in (0, 3):
-        edge = closure(edge_id, False)
-        edge.id = 0
-        live_node.edges.publish(edge)
+    first, second = closure(0, False), closure(3, False)
+    second.id = first.id
+    live_node.edges.publish(first)
+    if topics == 1:
+        live_node.edges.publish(second)
+    else:
+        live_node.arrays.publish(RelativeRotationArray(edges=[second]))
     said = "relative_rotations: different closures have the same id"
     live_node.spin_until(lambda: said in live_node.status["message"])
 
