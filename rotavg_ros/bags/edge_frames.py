@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rotavg_ros.bags.messages import Edge
-from rotavg_ros.inputs.sensor_frames import Mounting, SensorFrames
+from rotavg_ros.inputs.sensor_frames import BODY_HAS_NO_NAME, Mounting, SensorFrames
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE
 
 _ROBOT = ""  # a graph has only one
@@ -18,7 +18,7 @@ class EdgeFrames:
     """The mounting of a robot's sensors, known once its bag has been read."""
 
     def __init__(self) -> None:
-        self._sensors, self._body = SensorFrames(), ""
+        self._sensors, self._body, self._has_odometry = SensorFrames(), "", False
         self._unknown: dict[str, None] = {}
 
     def take(self, transforms: Any) -> None:
@@ -27,6 +27,7 @@ class EdgeFrames:
 
     def note_body(self, frame: str) -> None:
         """Remember the ``child_frame_id`` of odometry; the first non-empty one counts."""
+        self._has_odometry = True
         self._body = self._body or frame
         self._sensors.note_body(_ROBOT, frame)
 
@@ -53,10 +54,9 @@ class EdgeFrames:
     @property
     def warnings(self) -> tuple[str, ...]:
         """A line about edges that were taken as they are, although odometry is of another frame."""
-        if not self._unknown or not self._body:
+        if not self._unknown or not self._has_odometry:
             return ()
-        named = ", ".join(list(self._unknown)[:3])
-        return (
-            f"edges are in frame {named}, but odometry tells of {self._body}, and the bag has no static transform "
-            "between them: they are taken as they are",
-        )
+        named, why = ", ".join(list(self._unknown)[:3]), BODY_HAS_NO_NAME
+        if self._body:
+            why = f"odometry tells of {self._body}, and the bag has no static transform between them"
+        return (f"edges are in frame {named}, but {why}: they are taken as they are",)

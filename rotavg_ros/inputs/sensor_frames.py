@@ -18,6 +18,8 @@ from rotavg_ros.online.quaternion import IDENTITY, Quaternion, Vector
 
 # Most frames remembered; beyond, new ones are assumed to be nonsense.
 _MOST_FRAMES = 10_000
+# Why the mounting of a sensor cannot be known, whatever transforms there are.
+BODY_HAS_NO_NAME = "no odometry names the frame of the body (child_frame_id)"
 # Mountings on two robots that differ by less are alike, radians and metres: closures err by as much.
 _ALIKE_RAD, _ALIKE_M = math.radians(1.0), 0.1
 
@@ -97,6 +99,10 @@ class SensorFrames:
         if frame and robot not in self._bodies:
             self._bodies[robot] = _name(frame), Mounting(body_from_frame)
             self._found.clear()
+
+    def knows_body(self, robot: str) -> bool:
+        """Whether the frame of a robot's body is known; without it no sensor's mounting is."""
+        return robot in self._bodies
 
     def body_from(self, robot: str, sensor: str) -> Mounting | None:
         """The pose of a sensor's frame in the frame of a robot's body; None as long as it is not known."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.bags.topics import static_transforms
 from rotavg_ros.inputs import NAMES_ITS_BODY, ODOMETRY_CONVERTERS
-from rotavg_ros.inputs.sensor_frames import SensorFrames
+from rotavg_ros.inputs.sensor_frames import BODY_HAS_NO_NAME, SensorFrames
 from rotavg_ros.online import EdgeMeasurement
 from rotavg_ros.online.measurements import RejectedInputError
 from rotavg_ros.online.quaternion import Quaternion
@@ -21,7 +21,7 @@ class BagFrames:
     def __init__(self, bag: BagReader, plan: Plan) -> None:
         """Read the bag's static transforms, and the frames whose motion odometry describes."""
         self._is_on = plan.edge_frames_from_tf
-        self._sensors, self._bodies = SensorFrames(), set[str]()
+        self._sensors, self._bodies, self._has_odometry = SensorFrames(), set[str](), bool(plan.odometry)
         self._unknown: dict[str, dict[str, None]] = {}
         self._unlike: str | None = None
         for _, _, message in bag.decoded(static_transforms(bag.topics) if self._is_on else []):
@@ -53,12 +53,14 @@ class BagFrames:
 
         And one about the first edge between robots whose sensors are mounted differently.
         """
-        lines, bodies = [] if self._unlike is None else [self._unlike], ", ".join(sorted(self._bodies))
-        for topic, frames in self._unknown.items() if self._bodies else ():
+        lines, why = [] if self._unlike is None else [self._unlike], BODY_HAS_NO_NAME
+        if self._bodies:
+            bodies = ", ".join(sorted(self._bodies))
+            why = f"odometry tells of {bodies}, and the bag has no static transform between them"
+        for topic, frames in self._unknown.items() if self._has_odometry else ():
             named = ", ".join(list(frames)[:3])
             lines.append(
-                f"{topic} is in frame {named}, but odometry tells of {bodies}, and the bag has no static transform "
-                "between them: its edges are taken as they are; set edge_sensor_orientations"
+                f"{topic} is in frame {named}, but {why}: its edges are taken as they are; set edge_sensor_orientations"
             )
         return lines
 

@@ -509,7 +509,9 @@ def test_a_lift_leaves_the_plane(tmp_path: Path, by_stamp: bool, climb: float) -
     assert read_graph(tmp_path / "graph.npz").planar == read.planar
 
 
-def bag_of_a_camera(path: Path, frame: str, *, with_transform: bool, in_array: bool) -> tuple[Rotation, Path]:
+def bag_of_a_camera(
+    path: Path, frame: str, *, with_transform: bool, in_array: bool, body: str = "base_link"
+) -> tuple[Rotation, Path]:
     """Two odometry messages, a quarter of a turn apart, and the closure between them as a camera sees it."""
     turn, camera = Rotation.from_euler("z", 90, degrees=True), Rotation.from_euler("zx", [90, 90], degrees=True)
     seen = replace(
@@ -534,7 +536,9 @@ def bag_of_a_camera(path: Path, frame: str, *, with_transform: bool, in_array: b
         bag.add_topic(topic, RELATIVE_ROTATION_ARRAY if in_array else RELATIVE_ROTATION)
         for index, turned in enumerate((Rotation.identity(), turn)):
             stamp = (index + 1) * 10**9
-            bag.write(ODOM_TOPIC, stamp, odometry_message(stamp, np.array([index, 0.0, 0.0]), turned.as_quat(), "odom"))
+            odometry = odometry_message(stamp, np.array([index, 0.0, 0.0]), turned.as_quat(), "odom")
+            odometry.child_frame_id = body
+            bag.write(ODOM_TOPIC, stamp, odometry)
         bag.write(topic, 3 * 10**9, array if in_array else edge_message(seen))
         if with_transform:
             bag.write("/tf_static", 4 * 10**9, transforms)
@@ -559,3 +563,9 @@ def test_edges_that_nothing_places_are_told(
     assert main(["convert", str(bag), str(tmp_path / "graph.g2o")]) == 0
     warning = f"rotavg: warning: {bag}: edges are in frame camera, but odometry tells of base_link, and the bag has no "
     assert [line.startswith(warning) for line in capsys.readouterr().err.splitlines()] == [True] * is_told
+
+
+def test_odometry_that_does_not_name_the_body_is_told_of(tmp_path: Path) -> None:
+    _, bag = bag_of_a_camera(tmp_path / "bag", "camera", with_transform=True, in_array=False, body="")
+    (told,) = read_graph_bag(bag).warnings
+    assert told.startswith("edges are in frame camera, but no odometry names the frame of the body")

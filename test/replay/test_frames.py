@@ -137,6 +137,13 @@ def test_edges_that_nothing_places_are_taken_as_they_are(
     assert any(told in warning for warning in summary["warnings"]) == (not options)
 
 
+def test_odometry_that_does_not_name_the_body_is_told_of(tmp_path: Path) -> None:
+    """Transforms are of no use then; nothing had been said."""
+    write_bag(tmp_path / "bag", with_tf=True, nameless=SECONDS)
+    (told,) = replayed(tmp_path / "bag", tmp_path / "out")["warnings"]
+    assert told.startswith("/relative_rotations is in frame camera, but no odometry names the frame of the body")
+
+
 @pytest.mark.parametrize("with_tf", [True, False])
 def test_an_orientation_that_was_given_wins(tmp_path: Path, with_tf: bool) -> None:
     write_bag(tmp_path / "bag", with_tf)

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from rotavg_ros.inputs import EdgeRecord
-from rotavg_ros.inputs.sensor_frames import SensorFrames
+from rotavg_ros.inputs.sensor_frames import BODY_HAS_NO_NAME, SensorFrames
 from rotavg_ros.online import EdgeMeasurement
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.ros.node.intake.wiring import Input, Placement
@@ -134,7 +134,8 @@ class EdgeFrames:
         body_from_sensor = self._sensors.body_from(edge.source.robot, frame)
         if body_from_sensor is None:
             return False
-        if topic.placement.get((edge.source.robot, frame)) is Placement.UNKNOWN:
+        of_body = body_from_sensor.edge_of_body(edge)
+        if of_body != edge and topic.placement.get((edge.source.robot, frame)) is Placement.UNKNOWN:
             self._node.get_logger().warning(
                 f"{topic.name}: the transform of {frame} is known now; edges before it were taken as they were: call "
                 "~/reset to begin anew without them"
@@ -143,16 +144,19 @@ class EdgeFrames:
         unlike = self._sensors.unlike(edge, frame)
         if unlike is not None:
             self._node.get_logger().warning(f"{topic.name}: {unlike}", once=True)
-        self._add(replace(waiting.record, edge=body_from_sensor.edge_of_body(edge)), topic)
+        self._add(replace(waiting.record, edge=of_body), topic)
         return True
 
     def _give_up(self, waiting: _Waiting) -> None:
         """Pass an edge on as it is."""
         edge, frame, topic = waiting.edge, waiting.record.frame_id, waiting.topic
         if topic.placement.get((edge.source.robot, frame)) is not Placement.UNKNOWN:
+            why, remedy = BODY_HAS_NO_NAME, "have it do so"
+            if self._sensors.knows_body(edge.source.robot):
+                why, remedy = "no transform leads from it to the body's frame", f"publish it on {_TOPIC}"
             self._node.get_logger().warning(
                 f"{topic.name}: nothing has said how frame {frame} sits on the body of {edge.source.robot}, so its "
-                f"edges are taken as they are: publish the transform on {_TOPIC}, or set edge_sensor_orientations"
+                f"edges are taken as they are: {why}; {remedy}, or set edge_sensor_orientations"
             )
         topic.note_placement(edge.source.robot, frame, Placement.UNKNOWN)
         self._add(waiting.record, topic)

@@ -159,16 +159,22 @@ class Wiring:
                 if len(each.frames) > 1:
                     named = " and ".join(" → ".join(frames) for frames in each.frames)
                     lines.append(f"{each.name} comes in frames {named}: a robot's odometry has one source")
-        if "edge_sensor_orientations" in self._given or not bodies:
+        has_come = any(each.is_odometry and each.frames for each in self._inputs)
+        if "edge_sensor_orientations" in self._given or not has_come:
             return lines
+        why = ", but no odometry names the frame of the body (child_frame_id): have it do so"
+        if bodies:
+            why = (
+                f", but odometry tells of {', '.join(bodies)}: publish the transform between them on /tf_static (it is "
+                "read where tf2_msgs is installed)"
+            )
         known = {body.removeprefix("/") for body in bodies}  # tf1 put a '/' before names
         for each in self._inputs:
             sensors = [] if each.is_odometry else [name for name in each.sensors if name.removeprefix("/") not in known]
             if sensors:
                 lines.append(
-                    f"{each.name} is in frame {', '.join(sensors)}, but odometry tells of {', '.join(bodies)}: publish "
-                    "the transform between them on /tf_static (it is read where tf2_msgs is installed), or set "
-                    "edge_sensor_orientations to the orientation of the one in the other (0, 0, 0, 1 if they are equal)"
+                    f"{each.name} is in frame {', '.join(sensors)}{why}, or set edge_sensor_orientations to the "
+                    "orientation of the one in the other (0, 0, 0, 1 if they are equal)"
                 )
         return lines
 

@@ -138,7 +138,8 @@ def test_a_camera_that_nobody_places(foreign_packages, live_node, start_process)
     live_node.said.clear()
     live_node.spin_until(lambda: any("/relative_rotations is in frame camera" in said for _, said in live_node.said))
     assert "edge_sensor_orientations" in live_node.status["message"] and "/tf_static" in live_node.status["message"]
-    assert "nothing has said how frame camera sits on the body of robot" in live_node.process.output
+    said = "nothing has said how frame camera sits on the body of robot"
+    assert said in live_node.process.output and "publish it on /tf_static" in live_node.process.output
     start_process(sys.executable, SPEAKER, *mounted(camera))
     live_node.spin_until(lambda: live_node.probe.count_publishers("/tf_static") > 0)
 
@@ -244,3 +245,21 @@ def test_cameras_that_two_robots_carry_differently_are_warned_of_once(
     assert len(intake.handed_on) == 3
     told = "/edges: red/camera is mounted differently on red and on blue"
     assert capfd.readouterr().err.count(told) == (not alike)
+
+
+def test_without_the_name_of_a_bodys_frame_no_transform_is_asked_for(
+    executor: SingleThreadedExecutor, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Odometry of poses alone, or none: what the log had proposed, a transform, could not have helped."""
+    intake = Intake(executor, wait_s=0.0)
+    intake.take(0, "base_link", ("s", "s"))
+    for _ in range(100):
+        executor.spin_once(timeout_sec=0.01)
+        if intake.handed_on:
+            break
+    said = capfd.readouterr().err
+    assert "base_link sits on the body of s" in said and "names the frame of the body" in said and "/tf" not in said
+    # Odometry that comes later shows that they are the body's edges: there is nothing to begin anew for.
+    intake.frames.note_body("s", "base_link", (0.0, 0.0, 0.0, 1.0))
+    intake.take(1, "base_link", ("s", "s"))
+    assert len(intake.handed_on) == 2 and "~/reset" not in capfd.readouterr().err

@@ -112,7 +112,26 @@ def test_the_bodys_frame_is_the_bodys_with_a_slash_in_front_as_well() -> None:
     assert wiring.warnings(NodeParameters()) == []
     inputs[1].note_frames("/camera")
     (line,) = wiring.warnings(NodeParameters())
-    assert "is in frame /camera, but" in line
+    assert "is in frame /camera, but odometry tells of base_link: publish the transform" in line
+
+
+@pytest.mark.parametrize("bodys_frame", [(("odom", ""),), ()], ids=["nameless", "no odometry"])
+def test_odometry_that_does_not_name_the_bodys_frame(bodys_frame: tuple) -> None:
+    """As PoseStamped: no transform can place a sensor on the body. Nothing had been said."""
+    node = SimpleNamespace(
+        get_publishers_info_by_topic=lambda _: [],
+        count_publishers=lambda _: 0,
+        get_parameter=lambda _: SimpleNamespace(value=False),
+    )
+    kinds = (("odometry_topics", "robot", bodys_frame), ("edge_topics", "", (("camera",),)))
+    inputs = [
+        Input(f"/{kind}", "", kind, robot, QoSProfile(depth=1), dict.fromkeys(frames)) for kind, robot, frames in kinds
+    ]
+    lines = Wiring(node, inputs, [], frozenset()).warnings(NodeParameters())
+    told = (
+        "/edge_topics is in frame camera, but no odometry names the frame of the body (child_frame_id): have it do so"
+    )
+    assert [line.startswith(told) for line in lines] == [True] * len(bodys_frame)
 
 
 @pytest.mark.large
