@@ -85,8 +85,8 @@ class Input:
     def sensors(self) -> list[str]:
         """Frames whose edges are taken as they are, although they may be sensors' frames."""
         told = {frame for _, frame in self.placement}
-        unknown = {frame for (_, frame), placement in self.placement.items() if placement is Placement.UNKNOWN}
-        return [frame for (frame,) in self.frames if frame and (frame in unknown or frame not in told)]
+        unknown = [frame for (_, frame), placement in self.placement.items() if placement is Placement.UNKNOWN]
+        return list(dict.fromkeys([frame for (frame,) in self.frames if frame and frame not in told] + unknown))
 
 
 class Wiring:
@@ -172,8 +172,9 @@ class Wiring:
         for each in self._inputs:
             sensors = [] if each.is_odometry else [name for name in each.sensors if name.removeprefix("/") not in known]
             if sensors:
+                named = ", ".join(sensors[:_MOST_FRAMES])
                 lines.append(
-                    f"{each.name} is in frame {', '.join(sensors)}{why}, or set edge_sensor_orientations to the "
+                    f"{each.name} is in frame {named}{why}, or set edge_sensor_orientations to the "
                     "orientation of the one in the other (0, 0, 0, 1 if they are equal)"
                 )
         return lines

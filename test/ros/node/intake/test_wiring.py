@@ -19,7 +19,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rotavg_msgs.msg import AbsoluteOrientations, KeyframeReference, RelativeRotation, RelativeRotationArray
 from std_msgs.msg import Header
 
-from rotavg_ros.ros.node.intake.wiring import Input, Wiring
+from rotavg_ros.ros.node.intake.wiring import Input, Placement, Wiring
 from rotavg_ros.settings.parameters import NodeParameters
 
 pytestmark = pytest.mark.ros
@@ -132,6 +132,15 @@ def test_odometry_that_does_not_name_the_bodys_frame(bodys_frame: tuple) -> None
         "/edge_topics is in frame camera, but no odometry names the frame of the body (child_frame_id): have it do so"
     )
     assert [line.startswith(told) for line in lines] == [True] * len(bodys_frame)
+
+
+def test_a_sensor_that_nobody_places_is_named_however_many_frames_came_before() -> None:
+    """Robots with four cameras and more: only the first three frames of a topic had been looked at."""
+    edges = Input("/edges", "rotavg_msgs/msg/RelativeRotation", "edge_topics", "", QoSProfile(depth=1))
+    for number in range(5):
+        edges.note_frames(f"camera_{number}")
+        edges.note_placement("robot", f"camera_{number}", Placement.UNKNOWN if number == 4 else Placement.KNOWN)
+    assert edges.sensors == ["camera_4"]
 
 
 @pytest.mark.large
