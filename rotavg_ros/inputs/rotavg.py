@@ -38,13 +38,16 @@ class RelativeRotationConverter:
 
 
 class RelativeRotationArrayConverter(RelativeRotationConverter):
-    """Many edges in a message."""
+    """Many edges in a message, which may turn out to be malformed only while they are read."""
 
     def __call__(self, message: Any) -> Iterator[EdgeRecord]:
         frame_id = message.header.frame_id
-        for edge in message.edges:
-            for record in super().__call__(edge):
-                yield replace(record, frame_id=record.frame_id or frame_id, element=edge)
+        try:
+            for edge in message.edges:
+                for record in super().__call__(edge):
+                    yield replace(record, frame_id=record.frame_id or frame_id, element=edge)
+        except RejectedInputError as rejection:
+            yield EdgeRecord(rejection.reason)
 
 
 def edge_from_message(message: Any, source: Source) -> EdgeMeasurement:

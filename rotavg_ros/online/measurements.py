@@ -52,6 +52,7 @@ class RejectReason(str, Enum):
     GRAPH_FULL = "graph_full"
     MARGINALIZED_KEYFRAME = "marginalized_keyframe"
     WRONG_LENGTH = "wrong_length"
+    MALFORMED_MESSAGE = "malformed_message"
 
 
 class RejectedInputError(Exception):

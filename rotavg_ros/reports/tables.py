@@ -38,6 +38,7 @@ WHY_REFUSED = {
     RejectReason.GRAPH_FULL: "the graph has as many edges as it may have (max_edges, max_keyframes), and none to spare",
     RejectReason.MARGINALIZED_KEYFRAME: "the keyframe was taken out of a full graph too long ago (max_keyframes)",
     RejectReason.WRONG_LENGTH: "a rotation that is not four numbers, or a position that is not three",
+    RejectReason.MALFORMED_MESSAGE: "a message that ends too early; was its sender built with other definitions?",
 }
 
 

@@ -18,6 +18,8 @@ from typing import Any
 
 from rclpy.serialization import deserialize_message
 
+from rotavg_ros.online.measurements import RejectedInputError, RejectReason
+
 # Type names in message definitions, and their format characters in ``struct``.
 _PRIMITIVES = {
     "boolean": "?",
@@ -46,7 +48,9 @@ class SerializedArray:
 
     Attributes:
         header: a ``std_msgs/Header``, or an object with its fields.
-        edges: iterator over the elements, which are read on demand; they have the fields of the element's message.
+        edges: iterator over the elements, which are read on demand; they have the fields of the element's message. If
+            the bytes end too early, as of a sender with another definition of the message, it raises
+            :class:`RejectedInputError`.
     """
 
     def __init__(self, serialized: bytes, message_type: type) -> None:
@@ -55,13 +59,15 @@ class SerializedArray:
         (_, header_type), (name, sequence_type) = fields.items()
         self.header: Any
         self.edges: Iterator[Any]
-        order = _BYTE_ORDERS.get(serialized[:2])
-        if order is None:
-            whole = deserialize_message(serialized, message_type)
-            self.header, self.edges = whole.header, iter(getattr(whole, name))
-            return
-        content = memoryview(serialized)[_HEADER_BYTES:]
-        self.header, at = _reader(header_type, order)(content, 0)
+        order, content, at = _BYTE_ORDERS.get(serialized[:2]), memoryview(serialized)[_HEADER_BYTES:], 0
+        try:
+            if order is None:
+                whole = deserialize_message(serialized, message_type)
+                self.header, self.edges = whole.header, iter(getattr(whole, name))
+                return
+            self.header, at = _reader(header_type, order)(content, at)
+        except (struct.error, RuntimeError):  # the second is rclpy's
+            self.header, order, content = _message_class(header_type)(), "<", content[:0]
         element_type = sequence_type.removeprefix("sequence<").removesuffix(">")
         self.edges = _elements(content, at, element_type, order)
 
@@ -84,11 +90,14 @@ def _message_class(type_name: str) -> type:
 
 
 def _elements(content: memoryview, at: int, element_type: str, order: str) -> Iterator[Any]:
-    length, at = _reader("uint32", order)(content, at)
     read = _reader(element_type, order)
-    for _ in range(length):
-        element, at = read(content, at)
-        yield element
+    try:
+        length, at = _reader("uint32", order)(content, at)
+        for _ in range(length):
+            element, at = read(content, at)
+            yield element
+    except struct.error:
+        raise RejectedInputError(RejectReason.MALFORMED_MESSAGE) from None
 
 
 @cache

@@ -16,6 +16,7 @@ from rotavg_msgs.msg import KeyframeReference, RelativeRotation, RelativeRotatio
 from std_msgs.msg import Header
 
 from rotavg_ros.inputs import EDGE_CONVERTERS, Source
+from rotavg_ros.online import RejectReason
 from rotavg_ros.ros.node.intake.serialized_array import SerializedArray
 
 
@@ -84,7 +85,12 @@ def test_both_byte_orders_are_read_and_other_representations_are_left_to_rclpy(m
     ]
 
 
-def test_a_message_that_ends_too_early_is_an_error_and_not_nonsense() -> None:
-    serialized = serialize_message(some_edges(3))
-    with pytest.raises(struct.error):
-        list(SerializedArray(serialized[:-20], RelativeRotationArray).edges)
+@pytest.mark.parametrize("kept", [0.0, 0.01, 0.6])
+@pytest.mark.parametrize("representation", [b"\x00\x01", b"\x00\x07"])
+def test_a_message_that_ends_too_early_is_refused_and_not_nonsense(kept: float, representation: bytes) -> None:
+    """As of a sender that was built with another definition; it had ended in a traceback, and counted nowhere."""
+    serialized = representation + serialize_message(some_edges(3))[2:]
+    convert = EDGE_CONVERTERS["rotavg_msgs/msg/RelativeRotationArray"](Source("a"))
+    records = list(convert(SerializedArray(serialized[: round(kept * len(serialized))], RelativeRotationArray)))
+    assert records[-1].edge is RejectReason.MALFORMED_MESSAGE
+    assert len(records) <= 2 and all(record.edge is not RejectReason.MALFORMED_MESSAGE for record in records[:-1])
