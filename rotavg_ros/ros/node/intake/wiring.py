@@ -152,14 +152,13 @@ class Wiring:
         return sorted(by_others)[:_MOST_FRAMES]
 
     def _of_frames(self) -> list[str]:
-        lines, bodies = [], []
-        for each in self._inputs:
-            if each.is_odometry:
-                bodies += [body for _, body in each.frames if body and body not in bodies]
-                if len(each.frames) > 1:
-                    named = " and ".join(" → ".join(frames) for frames in each.frames)
-                    lines.append(f"{each.name} comes in frames {named}: a robot's odometry has one source")
-        has_come = any(each.is_odometry and each.frames for each in self._inputs)
+        lines, odometry = [], [each for each in self._inputs if each.is_odometry]
+        for each in odometry:
+            if len(each.frames) > 1:
+                named = " and ".join(" → ".join(frames) for frames in each.frames)
+                lines.append(f"{each.name} comes in frames {named}: a robot's odometry has one source")
+        bodies = list(dict.fromkeys(body for each in odometry for _, body in each.frames if body))
+        has_come = any(each.frames for each in odometry)
         if "edge_sensor_orientations" in self._given or not has_come:
             return lines
         why = ", but no odometry names the frame of the body (child_frame_id): have it do so"

@@ -113,6 +113,8 @@ def test_the_bodys_frame_is_the_bodys_with_a_slash_in_front_as_well() -> None:
     inputs[1].note_frames("/camera")
     (line,) = wiring.warnings(NodeParameters())
     assert "is in frame /camera, but odometry tells of base_link: publish the transform" in line
+    inputs[0].note_frames("map", "base_link")
+    assert "but odometry tells of base_link: publish" in wiring.warnings(NodeParameters())[-1]  # once, as any name
 
 
 @pytest.mark.parametrize("bodys_frame", [(("odom", ""),), ()], ids=["nameless", "no odometry"])
