@@ -134,9 +134,8 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
     elif edges and not odometry:
         settings.setdefault("unknown_keyframes", "create")
     parameters = NodeParameters().changed(settings)
-    from_tf = parameters.edge_frames_from_tf and "edge_sensor_orientations" not in values
     tick_work = None if "solve_period_s" in values else WorkRates()
-    plan = Plan(parameters, odometry, edges, {}, (), from_tf, tick_work, unused)
+    plan = Plan(parameters, odometry, edges, {}, (), parameters.places_edges_by_tf, tick_work, unused)
     plan = replace(plan, references=_references(bag, found, wishes.references, plan))
     return replace(plan, topics=_uses(bag, found, plan))
 

@@ -50,9 +50,9 @@ class NodeParameters:
         "empty: the first of robots",
     )
     edge_sensor_orientations: tuple[float, ...] = option(
-        (0.0, 0.0, 0.0, 1.0),
+        (0.0, 0.0, 0.0, 0.0),
         "orientation of each edge topic's sensor frame in the body frame, xyzw one after the other; one for all, "
-        "or one per edge topic",
+        "or one per edge topic; zeros: not stated",
     )
     forward_topics: tuple[str, ...] = option(
         ("",),
@@ -67,7 +67,7 @@ class NodeParameters:
     edge_frames_from_tf: bool = option(
         True,
         "take edges whose header names a sensor's frame into the body's, by /tf_static; not where "
-        "edge_sensor_orientations is given, or tf2_msgs not installed",
+        "edge_sensor_orientations is stated, or tf2_msgs not installed",
     )
     edge_frame_wait_s: float = option(
         3.0,
@@ -143,7 +143,7 @@ class NodeParameters:
             if other != robot:
                 raise OptionError(f"robots names {other!r} and {robot!r}, whose topics would both begin with {prefix}")
         _check_orientations("odometry", self.odometry_sensor_orientations, len(self.odometry_topics))
-        _check_orientations("edge", self.edge_sensor_orientations, len(self.edge_topics))
+        _check_orientations("edge", self._edge_orientations, len(self.edge_topics))
         for entry in self.edge_topics:
             topic, colon, message_type = entry.partition(":")
             if entry and not (topic and (message_type or not colon)):
@@ -196,6 +196,20 @@ class NodeParameters:
                 )
 
     @property
+    def states_edge_sensors(self) -> bool:
+        """Whether the parameters state how the sensors of edges are mounted."""
+        return any(self.edge_sensor_orientations)
+
+    @property
+    def places_edges_by_tf(self) -> bool:
+        """Whether transforms decide how the sensors of edges are mounted; what is stated wins."""
+        return self.edge_frames_from_tf and not self.states_edge_sensors
+
+    @property
+    def _edge_orientations(self) -> tuple[float, ...]:
+        return self.edge_sensor_orientations if self.states_edge_sensors else quaternion.IDENTITY
+
+    @property
     def state_path(self) -> Path | None:
         """The state file; None: none."""
         return path_of(self.state_file)
@@ -222,7 +236,7 @@ class NodeParameters:
         """For every edge topic, what its messages do not state themselves."""
         number = len(self.edge_topics)
         robots = self.edge_robots * (number // len(self.edge_robots))
-        sensors = _orientations(self.edge_sensor_orientations, number)
+        sensors = _orientations(self._edge_orientations, number)
         pairs = zip(robots, sensors, strict=True)
         return [Source(robot or self.robots[0], self.robots, sensor) for robot, sensor in pairs]
 

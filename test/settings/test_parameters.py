@@ -47,10 +47,16 @@ def test_help_tells_every_option_of_the_estimator() -> None:
 def test_the_table_and_the_yaml_name_every_parameter_once() -> None:
     assert list(table()) == list(PARAMETERS) == list(NodeParameters().values())
     ours = yaml.safe_load(to_yaml(NodeParameters()))["/rotavg"]["ros__parameters"]
-    assert [name for name in PARAMETERS if name not in ours] == ["edge_sensor_orientations"]  # stated, it rules out tf
-    assert list(ours) == [name for name in PARAMETERS if name in ours]
-    turned = NodeParameters().changed({"edge_sensor_orientations": [0.0, 0.0, 1.0, 0.0]})
-    assert list(yaml.safe_load(to_yaml(turned))["/rotavg"]["ros__parameters"]) == list(PARAMETERS)
+    assert list(ours) == list(PARAMETERS)
+
+
+def test_transforms_are_in_use_until_an_orientation_is_stated() -> None:
+    """Also with all defaults stated, as `ros2 param dump` writes them; those of edges had ruled transforms out."""
+    stated = NodeParameters().changed(NodeParameters().values())
+    assert stated == NodeParameters() and stated.places_edges_by_tf
+    assert [source.body_from_sensor for source in stated.edge_sources()] == [(0.0, 0.0, 0.0, 1.0)] * 2
+    assert not stated.changed({"edge_sensor_orientations": [0, 0, 0, 1]}).places_edges_by_tf
+    assert not stated.changed({"edge_frames_from_tf": False}).places_edges_by_tf
 
 
 def test_the_units_of_the_library_are_those_of_its_names() -> None:

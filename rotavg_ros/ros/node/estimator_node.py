@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, JumpThreshold, TimeJump
@@ -74,11 +73,7 @@ class RotavgNode(parameter_server.ParameterNode):
         self._worker = Worker(executor, "rotavg_worker")
         self._saver = Worker(executor, "rotavg_saver")
         self._outputs = Outputs(self, parameters, self._estimator)
-        given = frozenset(parameter_server.given(self))
-        # An orientation that was given decides how sensors are mounted.
-        from_tf = parameters.edge_frames_from_tf and "edge_sensor_orientations" not in given
-        listened = replace(parameters, edge_frames_from_tf=from_tf)
-        listening = Subscriptions(self, listened, self._estimator, self._health, self._outputs, self._on_time_jump)
+        listening = Subscriptions(self, parameters, self._estimator, self._health, self._outputs, self._on_time_jump)
         self._listening, self._forwarding = listening, listening.forwarding
         if on_resuming is not None:
             on_resuming()
@@ -102,7 +97,7 @@ class RotavgNode(parameter_server.ParameterNode):
         self.get_logger().info(f"rotavg {__version__} on {device}, listening to {topics}")
         if parameters.estimator.device == "cuda" and device == "cpu":
             self.get_logger().warning("there is no CUDA device; the networks run on the CPU")
-        self._wiring = Wiring(self, listening.inputs, self._outputs.exclusive_topics, given)
+        self._wiring = Wiring(self, listening.inputs, self._outputs.exclusive_topics)
         self._mistaken_parameters, other_parameters = parameter_server.unknown(self)
         for line in [*self._mistaken_parameters, *other_parameters, *self._outputs.warnings()]:
             self.get_logger().warning(line)

@@ -64,7 +64,7 @@ class Subscriptions:
             estimator,
             self.forwarding,
             partial(self._warn_of_refusal, "an edge"),
-            parameters.edge_frame_wait_s if parameters.edge_frames_from_tf else None,
+            parameters.edge_frame_wait_s if parameters.places_edges_by_tf else None,
         )
         best_effort = QoSProfile(depth=parameters.odometry_queue_depth, reliability=ReliabilityPolicy.BEST_EFFORT)
         sources = zip(parameters.robots, parameters.odometry_topics, parameters.odometry_sensors(), strict=True)

@@ -18,7 +18,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
 from rotavg_ros.ros.node.intake.forwarding import Forward
-from rotavg_ros.settings.parameters import NodeParameters
+from rotavg_ros.settings.parameters import PARAMETERS, NodeParameters
 
 _CLOCK = "/clock"
 # Frames come from messages and may be anything; this many different ones per topic are enough for a warning.
@@ -92,16 +92,15 @@ class Input:
 class Wiring:
     """Checks the ROS graph around a node, and the messages that came over it."""
 
-    def __init__(self, node: Node, inputs: Sequence[Input], outputs: Sequence[str], given: frozenset[str]) -> None:
+    def __init__(self, node: Node, inputs: Sequence[Input], outputs: Sequence[str]) -> None:
         """Watch a node.
 
         Args:
             node: the node.
             inputs: what it listens to.
             outputs: full names of topics that only this node should publish.
-            given: names of the parameters that it was started with.
         """
-        self._node, self._inputs, self._outputs, self._given = node, inputs, outputs, given
+        self._node, self._inputs, self._outputs = node, inputs, outputs
 
     def warnings(self, parameters: NodeParameters) -> list[str]:
         """One line for each present mistake."""
@@ -116,7 +115,7 @@ class Wiring:
             elif now - each.published > parameters.odometry_timeout_s:
                 missing.append(each)
         found += self._of_missing(missing, parameters)
-        found += self._of_frames()
+        found += self._of_odometry() + ([] if parameters.states_edge_sensors else self._of_sensors())
         for topic in self._outputs:
             if self._node.count_publishers(topic) > 1:
                 found.append(f"another node publishes {topic}, too: stop it, or give one of them a namespace")
@@ -128,7 +127,8 @@ class Wiring:
         """Warnings about needed topics that nobody publishes."""
         edges = [each for each in self._inputs if not each.is_odometry]
         # The default topics are two forms of the same input; a user of one does not need the other.
-        all_needed = "edge_topics" in self._given or all(each in missing for each in edges)
+        are_chosen = parameters.edge_topics != PARAMETERS["edge_topics"].default
+        all_needed = are_chosen or all(each in missing for each in edges)
         needs_odometry = parameters.estimator.needs_odometry
         lines = []
         for each in missing:
@@ -151,16 +151,21 @@ class Wiring:
         )
         return sorted(by_others)[:_MOST_FRAMES]
 
-    def _of_frames(self) -> list[str]:
-        lines, odometry = [], [each for each in self._inputs if each.is_odometry]
-        for each in odometry:
-            if len(each.frames) > 1:
+    def _of_odometry(self) -> list[str]:
+        """Warnings about odometry in several frames."""
+        lines = []
+        for each in self._inputs:
+            if each.is_odometry and len(each.frames) > 1:
                 named = " and ".join(" → ".join(frames) for frames in each.frames)
                 lines.append(f"{each.name} comes in frames {named}: a robot's odometry has one source")
-        bodies = list(dict.fromkeys(body for each in odometry for _, body in each.frames if body))
-        has_come = any(each.frames for each in odometry)
-        if "edge_sensor_orientations" in self._given or not has_come:
-            return lines
+        return lines
+
+    def _of_sensors(self) -> list[str]:
+        """Warnings about edges in frames of which nobody knows how they sit on the body."""
+        frames = [frames for each in self._inputs if each.is_odometry for frames in each.frames]
+        if not frames:
+            return []
+        bodies = list(dict.fromkeys(body for _, body in frames if body))
         why = ", but no odometry names the frame of the body (child_frame_id): have it do so"
         if bodies:
             why = (
@@ -168,6 +173,7 @@ class Wiring:
                 "read where tf2_msgs is installed)"
             )
         known = {body.removeprefix("/") for body in bodies}  # tf1 put a '/' before names
+        lines = []
         for each in self._inputs:
             sensors = [] if each.is_odometry else [name for name in each.sensors if name.removeprefix("/") not in known]
             if sensors:

@@ -108,7 +108,7 @@ def test_the_bodys_frame_is_the_bodys_with_a_slash_in_front_as_well() -> None:
     )
     kinds = (("odometry_topics", "robot", ("odom", "base_link")), ("edge_topics", "", ("/base_link",)))
     inputs = [Input(f"/{kind}", "", kind, robot, QoSProfile(depth=1), {frames: None}) for kind, robot, frames in kinds]
-    wiring = Wiring(node, inputs, [], frozenset())
+    wiring = Wiring(node, inputs, [])
     assert wiring.warnings(NodeParameters()) == []
     inputs[1].note_frames("/camera")
     (line,) = wiring.warnings(NodeParameters())
@@ -129,11 +129,30 @@ def test_odometry_that_does_not_name_the_bodys_frame(bodys_frame: tuple) -> None
     inputs = [
         Input(f"/{kind}", "", kind, robot, QoSProfile(depth=1), dict.fromkeys(frames)) for kind, robot, frames in kinds
     ]
-    lines = Wiring(node, inputs, [], frozenset()).warnings(NodeParameters())
+    lines = Wiring(node, inputs, []).warnings(NodeParameters())
     told = (
         "/edge_topics is in frame camera, but no odometry names the frame of the body (child_frame_id): have it do so"
     )
     assert [line.startswith(told) for line in lines] == [True] * len(bodys_frame)
+
+
+@pytest.mark.parametrize("topics", [NodeParameters().edge_topics, ("one", "two")])
+def test_who_states_the_default_topics_needs_no_more_than_one_of_them(topics: tuple[str, ...]) -> None:
+    """As a file of all defaults does; those that are chosen are all needed."""
+    names = [topic.partition(":")[0] for topic in topics]
+    node = SimpleNamespace(
+        get_publishers_info_by_topic=lambda name: (
+            [SimpleNamespace(topic_type="t", qos_profile=qos)] * (name == names[0])
+        ),
+        get_topic_names_and_types=list,
+        get_fully_qualified_name=lambda: "/rotavg",
+        count_publishers=lambda _: 0,
+        get_parameter=lambda _: SimpleNamespace(value=False),
+    )
+    qos = QoSProfile(depth=1)
+    inputs = [Input(name, "t", "edge_topics", "", qos, published=-1e9) for name in names]
+    lines = Wiring(node, inputs, []).warnings(NodeParameters().changed({"edge_topics": topics}))
+    assert lines == ["nobody publishes two (edge_topics): is it started?"] * (names[1] == "two")
 
 
 def test_a_sensor_that_nobody_places_is_named_however_many_frames_came_before() -> None:
