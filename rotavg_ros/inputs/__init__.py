@@ -20,6 +20,7 @@ from rotavg_ros.inputs.registry import (
     NAMES_ITS_BODY,
     ODOMETRY_CONVERTERS,
     OF_ONE_ROBOT,
+    WITHOUT_CLOSURES,
 )
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "NAMES_ITS_BODY",
     "ODOMETRY_CONVERTERS",
     "OF_ONE_ROBOT",
+    "WITHOUT_CLOSURES",
     "EdgeConverter",
     "EdgeRecord",
     "EdgeVerdict",

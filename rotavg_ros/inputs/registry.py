@@ -42,6 +42,9 @@ OF_ONE_ROBOT = BRINGS_KEYFRAMES - {
     "cslam_common_interfaces/msg/InterRobotLoopClosure",
 }
 
+# Types that carry keyframes and the steps between them, but no closures.
+WITHOUT_CLOSURES = frozenset({"slam_toolbox/msg/NewNodeEvent", "cslam_common_interfaces/msg/KeyframeOdom"})
+
 # Its frame_id is the frame attached to the body; it does not name the frame in which the body turns.
 FRAMELESS_ODOMETRY = "sensor_msgs/msg/Imu"
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from rotavg_ros.inputs import BRINGS_KEYFRAMES, FRAMELESS_ODOMETRY, OF_ONE_ROBOT, Source
+from rotavg_ros.inputs import BRINGS_KEYFRAMES, FRAMELESS_ODOMETRY, OF_ONE_ROBOT, WITHOUT_CLOSURES, Source
 from rotavg_ros.online import EstimatorOptions, quaternion
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.option import Option, OptionError, check_options, option, options_of, path_of
@@ -170,7 +170,7 @@ class NodeParameters:
                 )
 
     def _check_forwards(self) -> None:
-        known = [entry.partition(":")[0] for entry in self.edge_topics]
+        known = {topic: message_type for topic, _, message_type in (entry.partition(":") for entry in self.edge_topics)}
         outputs = self.forwarded()
         entries = [entry for entry in self.forward_topics if entry]
         for entry in entries:
@@ -179,6 +179,11 @@ class NodeParameters:
                 raise OptionError(f"forward_topics: {entry!r} names no two topics; write topic:output")
             if topic not in known:
                 raise OptionError(f"forward_topics: {topic} is none of edge_topics ({', '.join(known)})")
+            if known[topic] in WITHOUT_CLOSURES:
+                raise OptionError(
+                    f"forward_topics: {topic} is {known[topic]}, which carries no closures: have the back end listen "
+                    "to it itself"
+                )
             if output in known:
                 raise OptionError(f"forward_topics: {output} is listened to; choose another output for {topic}")
         if len(set(outputs.values())) < len(entries):

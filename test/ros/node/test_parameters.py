@@ -75,6 +75,14 @@ def test_the_defaults_are_good_and_declared_with_descriptions_and_ranges(make_no
         ({"edge_robots": ["a", "b", "c"]}, "edge_robots has 3 entries; give 1, or one per edge topic"),
         ({"edge_topics": ["graph:rtabmap_msgs/msg/MapGraph"]}, "set keyframe_source to edges"),
         ({"autosave_period_s": 5.0}, "state_file is empty"),
+        (
+            {
+                "edge_topics": ["keyframes:cslam_common_interfaces/msg/KeyframeOdom"],
+                "keyframe_source": "edges",
+                "forward_topics": ["keyframes:trusted"],
+            },
+            "keyframes is cslam_common_interfaces/msg/KeyframeOdom, which carries no closures",
+        ),
     ],
 )
 def test_mistakes_are_one_clear_line(make_node, overrides: dict[str, object], message: str) -> None:
