@@ -109,7 +109,7 @@ class Wiring:
         missing = []
         for each in self._inputs:
             publishers = self._node.get_publishers_info_by_topic(each.name)
-            found += _of_publishers(each, publishers)
+            found += _of_publishers(each, publishers) + self._of_definitions(each, publishers)
             if publishers:
                 each.is_published()
             elif now - each.published > parameters.odometry_timeout_s:
@@ -122,6 +122,22 @@ class Wiring:
         if self._node.get_parameter("use_sim_time").value and self._node.count_publishers(_CLOCK) == 0:
             found.append(f"use_sim_time is set, but nobody publishes {_CLOCK}: play the bag with --clock or unset it")
         return found
+
+    def _of_definitions(self, topic: Input, publishers: Sequence[TopicEndpointInfo]) -> list[str]:
+        """Warnings about publishers whose messages have other fields, though their type has the same name."""
+        told = [(_name(each), _definition(each)) for each in publishers if each.topic_type == topic.type_name]
+        if not any(definition for _, definition in told):
+            return []
+        own = self._node.get_fully_qualified_name()
+        subscriptions = self._node.get_subscriptions_info_by_topic(topic.name)
+        ours = {_definition(each) for each in subscriptions if (_name(each), each.topic_type) == (own, topic.type_name)}
+        package = topic.type_name.partition("/")[0]
+        return [
+            f"{topic.name}: {name} was built with another definition of {topic.type_name}, so its messages are "
+            f"lost or misread: build both with the same {package}"
+            for name, definition in told
+            if definition and ours and definition not in ours
+        ]
 
     def _of_missing(self, missing: Sequence[Input], parameters: NodeParameters) -> list[str]:
         """Warnings about needed topics that nobody publishes."""
@@ -206,6 +222,12 @@ def _of_publishers(topic: Input, publishers: Sequence[TopicEndpointInfo]) -> lis
                 remedy = f"-p qos_overrides.{topic.name}.subscription.reliability:=best_effort"
             lines.append(f"{topic.name}: nothing arrives from {_name(each)}, whose QoS is incompatible: {remedy}")
     return lines
+
+
+def _definition(endpoint: TopicEndpointInfo) -> str:
+    """The hash of the definition of an endpoint's messages; empty if it does not tell, as in Humble."""
+    told = str(getattr(endpoint, "topic_type_hash", ""))
+    return told if told.startswith("RIHS") else ""
 
 
 def _name(endpoint: TopicEndpointInfo) -> str:

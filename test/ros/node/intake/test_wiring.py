@@ -136,20 +136,41 @@ def test_odometry_that_does_not_name_the_bodys_frame(bodys_frame: tuple) -> None
     assert [line.startswith(told) for line in lines] == [True] * len(bodys_frame)
 
 
+def test_a_sender_that_was_built_with_another_definition_is_named() -> None:
+    """As on a machine where rotavg_msgs is older; its messages were lost or misread, and nothing was said."""
+
+    def endpoint(node_name: str, told: str) -> SimpleNamespace:
+        type_name = "rotavg_msgs/msg/RelativeRotation"
+        return SimpleNamespace(
+            topic_type=type_name, qos_profile=qos, node_namespace="/", node_name=node_name, topic_type_hash=told
+        )
+
+    qos = QoSProfile(depth=1)
+    senders = [endpoint("same", "RIHS01_a"), endpoint("older", "RIHS01_b"), endpoint("tells_nothing", "INVALID")]
+    node = SimpleNamespace(
+        get_publishers_info_by_topic=lambda _: senders,
+        get_subscriptions_info_by_topic=lambda _: [endpoint("rotavg", "RIHS01_a"), endpoint("other", "RIHS01_b")],
+        get_fully_qualified_name=lambda: "/rotavg",
+        count_publishers=lambda _: 0,
+        get_parameter=lambda _: SimpleNamespace(value=False),
+    )
+    edges = Input("/edges", "rotavg_msgs/msg/RelativeRotation", "edge_topics", "", qos)
+    (line,) = Wiring(node, [edges], []).warnings(NodeParameters())
+    assert line.startswith("/edges: /older was built with another definition of rotavg_msgs/msg/RelativeRotation")
+
+
 @pytest.mark.parametrize("topics", [NodeParameters().edge_topics, ("one", "two")])
 def test_who_states_the_default_topics_needs_no_more_than_one_of_them(topics: tuple[str, ...]) -> None:
     """As a file of all defaults does; those that are chosen are all needed."""
-    names = [topic.partition(":")[0] for topic in topics]
+    names, qos = [topic.partition(":")[0] for topic in topics], QoSProfile(depth=1)
+    sender = SimpleNamespace(topic_type="t", qos_profile=qos, node_namespace="/", node_name="sender")
     node = SimpleNamespace(
-        get_publishers_info_by_topic=lambda name: (
-            [SimpleNamespace(topic_type="t", qos_profile=qos)] * (name == names[0])
-        ),
+        get_publishers_info_by_topic=lambda name: [sender] * (name == names[0]),
         get_topic_names_and_types=list,
         get_fully_qualified_name=lambda: "/rotavg",
         count_publishers=lambda _: 0,
         get_parameter=lambda _: SimpleNamespace(value=False),
     )
-    qos = QoSProfile(depth=1)
     inputs = [Input(name, "t", "edge_topics", "", qos, published=-1e9) for name in names]
     lines = Wiring(node, inputs, []).warnings(NodeParameters().changed({"edge_topics": topics}))
     assert lines == ["nobody publishes two (edge_topics): is it started?"] * (names[1] == "two")
