@@ -35,7 +35,7 @@ class FrameCorrection:
             raise UserError("publish_tf needs tf2_msgs: install that package or leave publish_tf off") from error
         self._message_type, self._world_frame, self._tolerance_ns = TFMessage, world_frame, tolerance_ns
         self._publisher = publisher(node, TFMessage, "/tf", QoSProfile(depth=100))
-        self._robot_of_frame: dict[str, str] = {}
+        self._placed: dict[str, str] = {}  # the frame of each robot's odometry that was placed last
         self._mistakes: dict[str, str] = {}
 
     def publish(self, robot: str, topic: str, odometry: Header, frame: OdometryFrame) -> None:
@@ -45,6 +45,7 @@ class FrameCorrection:
             self._mistakes[topic] = f"publish_tf says nothing about {topic}: {mistake}"
             return
         self._mistakes.pop(topic, None)
+        self._placed[robot] = odometry.frame_id
         stamp = to_time(to_nanoseconds(odometry.stamp) + self._tolerance_ns)
         header = Header(stamp=stamp, frame_id=self._world_frame)
         transform = TransformStamped(header=header, child_frame_id=odometry.frame_id)
@@ -65,7 +66,7 @@ class FrameCorrection:
             return f"tf2 takes no frame that begins with '/', as {frame} does; have the driver leave that out"
         if frame == self._world_frame:
             return f"it is in the world frame {frame} already; set world_frame to another one, or feed the raw odometry"
-        other = self._robot_of_frame.setdefault(frame, robot)
-        if other != robot:
-            return f"{other} has the odometry frame {frame}, too; give each robot a frame of its own"
+        for other, placed in self._placed.items():
+            if other != robot and placed == frame:
+                return f"{other} has the odometry frame {frame}, too; give each robot a frame of its own"
         return None

@@ -254,6 +254,31 @@ def test_tf_places_only_frames_that_can_be(foreign_packages, live_node, start_pr
     live_node.spin_until(lambda: any("says nothing" not in said for _, said in live_node.said))
 
 
+def test_tf_places_a_frame_that_another_robot_has_given_up(foreign_packages, live_node, start_process) -> None:
+    """Its driver was started anew with a frame of its own; the warning had stayed."""
+    topics = ("odometry_topics:=['odom', 'other/odom']", "robots:=['a', 'b']")
+    start_alone(live_node, start_process, *EVERY_MESSAGE, PATIENT, "publish_tf:=true", *topics)
+    with publishing(live_node, Odometry, "/other/odom") as other:
+        live_node.spin_until(lambda: all(each.get_subscription_count() for each in (live_node.odometry, other)))
+        told = "publish_tf says nothing about /other/odom: a has the odometry frame odom, too"
+
+        def until_told(frame: str, is_told: bool) -> None:
+            live_node.said.clear()
+
+            def went_on() -> bool:
+                until_told.second = second = until_told.second + 1
+                live_node.odometry.publish(odometry(second, frame))
+                live_node.spin_for(0.2)
+                other.publish(odometry(second, "odom"))
+                return any((told in said) == is_told for _, said in live_node.said[-1:])
+
+            live_node.spin_until(went_on)
+
+        until_told.second = 0
+        until_told("odom", True)
+        until_told("a/odom", False)
+
+
 LISTENING = """
 import rclpy
 from tf2_msgs.msg import TFMessage
