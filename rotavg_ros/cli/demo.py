@@ -16,6 +16,7 @@ from rotavg_ros.bags.graph_to_bag import write_graph_bag
 from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC
+from rotavg_ros.cli.options.simulate import add_run_arguments
 from rotavg_ros.cli.progress import working
 from rotavg_ros.cli.simulate import describe, simulate
 from rotavg_ros.datasets.dead_reckoning import chain_poses
@@ -52,6 +53,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Prepare, play, judge, show."""
     if arguments.graph is None and (arguments.truth is not None or arguments.stamps is not None):
         raise DemoError("--truth and --stamps belong to --graph; give the graph as well")
+    if arguments.graph is not None and (stated := _of_a_run(arguments)):
+        raise DemoError(
+            f"--graph is your own graph, and {', '.join(stated)} is of a simulated run; leave one of them out"
+        )
     try:
         from rotavg_ros.ros.harness.live_run import Playing, installed_node, keep_to_this_machine, play_to_node
     except ImportError as error:
@@ -80,6 +85,14 @@ def run(arguments: argparse.Namespace) -> int:
     (output / "summary.json").write_text(json.dumps(_summary(report), indent=2) + "\n", encoding="utf-8")
     print("\n" + _table(report) + f"\n\npicture: {output / 'demo.png'}")
     return 0
+
+
+def _of_a_run(arguments: argparse.Namespace) -> list[str]:
+    """Options that say what a simulated run is like, and are not at their defaults."""
+    parser = argparse.ArgumentParser()
+    add_run_arguments(parser)
+    defaults = vars(parser.parse_args([]))
+    return [f"--{name.replace('_', '-')}" for name, value in defaults.items() if getattr(arguments, name) != value]
 
 
 def _new_folder(wanted: Path | None) -> Path:
