@@ -16,7 +16,7 @@ from rotavg_ros.inputs import BRINGS_KEYFRAMES, EDGE_CONVERTERS, ODOMETRY_CONVER
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.replay.pace import Pace, WorkRates
 from rotavg_ros.replay.record import TopicUse
-from rotavg_ros.replay.topics import Candidate, Candidates, can_be_read_as, find_candidates
+from rotavg_ros.replay.topics import Candidate, Candidates, can_be_read_as, find_candidates, of_others, robots_of
 from rotavg_ros.settings.parameters import NodeParameters
 
 # Parameters that name topics, and for each the parameters with values per topic, with the number of values.
@@ -121,7 +121,7 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
     values = {name: value for name, value in values.items() if name not in _OF_LIVE_NODES}
     values = _without_absent_topics(bag, values)
     odometry = _odometry(bag, found, wishes.odometry, values.get("odometry_topics", ()))
-    edges = _edges(bag, found, wishes.edges or values.get("edge_topics"))
+    edges = _edges(bag, found, wishes.edges or values.get("edge_topics"), odometry)
     settings = dict(values)
     topics = _odometry_topics(odometry, () if wishes.odometry else values.get("odometry_topics", ()))
     settings["robots"] = robots = _robots(wishes.robots or values.get("robots"), topics)
@@ -129,6 +129,9 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
         topics = tuple(f"/{robot}/odom" for robot in robots)  # the bag has none, whatever its name
     settings["odometry_topics"] = topics
     settings["edge_topics"] = tuple(map(_entry, edges))
+    of_edges = robots_of([edge.topic for edge in edges], topics, robots) if len(robots) > 1 else ()
+    if any(of_edges) and (wishes.edges or "edge_topics" not in values):  # those among parameters mean what a node does
+        settings.setdefault("edge_robots", of_edges)
     if any(edge.topic in found.brings_keyframes or edge.type_name in BRINGS_KEYFRAMES for edge in edges):
         settings.setdefault("keyframe_source", "edges")
     elif edges and not odometry:
@@ -191,10 +194,21 @@ def _odometry_topics(odometry: Sequence[Input], listed: Sequence[str]) -> tuple[
     return tuple(entry_of.get(entry.partition(":")[0].lstrip("/"), entry) for entry in listed)
 
 
-def _edges(bag: BagReader, found: Candidates, wanted: Sequence[str] | None) -> tuple[Input, ...]:
+def _edges(
+    bag: BagReader, found: Candidates, wanted: Sequence[str] | None, odometry: Sequence[Input]
+) -> tuple[Input, ...]:
+    """The topics wanted, else all but those of robots whose odometry is not used."""
     if wanted is None:
-        wanted = [edge.topic for edge in found.edges]
+        others = _of_others(found, odometry)
+        wanted = [edge.topic for edge in found.edges if edge.topic not in others]
     return _chosen(bag, wanted, EDGE_CONVERTERS, "relative rotations", found.edges)
+
+
+def _of_others(found: Candidates, odometry: Sequence[Input]) -> frozenset[str]:
+    """Topics of the closures of other robots; an IMU beside a camera makes it no robot, where others have odometry."""
+    used, types = [source.topic for source in odometry], {source.type_name for source in odometry}
+    other = [each.topic for each in found.odometry if each.topic not in used and each.type_name in types]
+    return of_others([edge.topic for edge in found.edges], used, other)
 
 
 def _chosen(
@@ -275,9 +289,11 @@ def _uses(bag: BagReader, found: Candidates, plan: Plan) -> tuple[TopicUse, ...]
     roles: dict[str, list[str]] = {}
     for robot, source, _ in plan.odometry_of_robots():
         roles.setdefault(source.topic, []).append(f"odometry of {robot}")
-    for source in plan.edges:
-        brings = plan.parameters.estimator.keyframe_source == "edges"
-        roles.setdefault(source.topic, []).append("keyframes and loop closures" if brings else "loop closures")
+    brings = plan.parameters.estimator.keyframe_source == "edges"
+    role = "keyframes and loop closures" if brings else "loop closures"
+    stated = plan.parameters.edge_robots
+    for source, robot in zip(plan.edges, stated * (len(plan.edges) // len(stated)), strict=True):
+        roles.setdefault(source.topic, []).append(f"{role} of {robot}" if robot else role)
     for robot, reference in plan.references.items():
         if isinstance(reference, Input):
             roles.setdefault(reference.topic, []).append(f"reference for {robot}")
@@ -286,6 +302,8 @@ def _uses(bag: BagReader, found: Candidates, plan: Plan) -> tuple[TopicUse, ...]
     could_be = {candidate.topic: "could be a reference: --reference" for candidate in found.references}
     could_be |= {candidate.topic: "could be odometry: --odometry" for candidate in found.odometry}
     could_be |= {candidate.topic: "could be loop closures: --edges" for candidate in found.edges}
+    others = _of_others(found, plan.odometry)
+    could_be |= dict.fromkeys(others, "loop closures of another robot, by its namespace: --odometry, --edges")
     nothing = "neither odometry nor relative rotations"
     return tuple(
         TopicUse(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
@@ -109,6 +111,27 @@ def _states_orientation(bag: BagReader, candidate: Candidate) -> bool:
     return False
 
 
+def of_others(edges: Sequence[str], odometry: Sequence[str], other_odometry: Sequence[str]) -> frozenset[str]:
+    """The topics of edges that are of robots other than those whose odometry is used.
+
+    They are in the namespace of another odometry. None is, where none of the topics is in a namespace that is used: a
+    sensor that has odometry of its own may be all that sees loops.
+    """
+    own = _named(odometry)
+    if not any(_namespace(topic) in own for topic in edges):
+        return frozenset()
+    others = _named(other_odometry) - own
+    return frozenset(topic for topic in edges if _namespace(topic) in others)
+
+
+def robots_of(edges: Sequence[str], odometry: Sequence[str], robots: Sequence[str]) -> tuple[str, ...]:
+    """For each topic of edges the robot, of one odometry topic each, that alone has its namespace; else empty."""
+    namespaces = [_namespace(topic) for topic in odometry]
+    count = Counter(namespaces)
+    robot_of = {name: robot for name, robot in zip(namespaces, robots, strict=False) if name and count[name] == 1}
+    return tuple(robot_of.get(_namespace(topic), "") for topic in edges)
+
+
 def can_be_read_as(bag: BagReader, topic: str, type_name: str) -> bool:
     """Whether a topic's messages have the fields of a type, as those of a renamed package do, judged by the first."""
     for _, _, message in islice(bag.decoded([topic]), _FIRST_EDGES):
@@ -133,3 +156,13 @@ def _has_odometry_edges(bag: BagReader, candidate: Candidate) -> bool:
             if record.edge.kind == EdgeKind.ODOMETRY:
                 return True
     return False
+
+
+def _named(topics: Sequence[str]) -> frozenset[str]:
+    return frozenset(map(_namespace, topics)) - {""}
+
+
+def _namespace(topic: str) -> str:
+    """The first part of a topic's name; empty if it has no other."""
+    first, _, rest = topic.strip("/").partition("/")
+    return first if rest else ""

@@ -128,6 +128,38 @@ def test_several_robots(plan_for) -> None:
     assert named.parameters.robots == ("r", "b")
 
 
+def test_closures_are_of_the_robot_in_whose_namespace_they_are(plan_for) -> None:
+    topics = {"/a/odom": ODOM, "/b/odom": ODOM, "/between": CLOSURE, "/a/loops": CLOSURE, "/b/loops": CLOSURE}
+    both = ["/b/odom", "/a/odom"]
+    plan = plan_for(topics, odometry=both, robots=["blue", "amber"])
+    assert roles(plan) == {
+        "/a/odom": "odometry of amber",
+        "/b/odom": "odometry of blue",
+        "/between": "loop closures",
+        "/a/loops": "loop closures of amber",
+        "/b/loops": "loop closures of blue",
+    }
+    assert [source.robot for source in plan.parameters.edge_sources()] == ["amber", "blue", "blue"]
+    told = plan_for(topics, odometry=both, values={"edge_robots": ("a", "b", "a")})
+    assert told.parameters.edge_robots == ("a", "b", "a")
+    listed = plan_for(topics, odometry=both, values={"edge_topics": ("/a/loops", "/b/loops")})
+    assert listed.parameters.edge_robots == ("",)  # as a node with these parameters has it
+
+
+def test_closures_of_a_robot_whose_odometry_is_not_used_are_left_out(plan_for) -> None:
+    topics = {"/a/odom": ODOM, "/b/odom": ODOM, "/between": CLOSURE, "/a/loops": CLOSURE, "/b/loops": CLOSURE}
+    plan = plan_for(topics)
+    assert roles(plan) == {"/a/odom": "odometry of robot", "/between": "loop closures", "/a/loops": "loop closures"}
+    why = {use.topic: use.why_not for use in plan.topics}["/b/loops"]
+    assert why == "loop closures of another robot, by its namespace: --odometry, --edges"
+    assert set(roles(plan_for(topics, odometry=["/b/odom"]))) == {"/b/odom", "/between", "/b/loops"}
+    assert "/b/loops" in roles(plan_for(topics, edges=["/b/loops"]))
+    sensor = {"/wheels/odom": ODOM, "/camera/visual": ODOM, "/camera/loops": CLOSURE}
+    assert "/camera/loops" in roles(plan_for(sensor))
+    sensor = {"/robot/odom": ODOM, "/robot/loops": CLOSURE, "/camera/imu": GOOD_IMU, "/camera/loops": CLOSURE}
+    assert "/camera/loops" in roles(plan_for(sensor))
+
+
 def test_options_win_over_parameters_and_these_over_guesses(plan_for) -> None:
     topics = {"/odom": ODOM, "/visual": ODOM, "/imu": GOOD_IMU}
     values = {"odometry_topics": ("visual",)}
@@ -301,12 +333,7 @@ def test_topics_are_those_of_the_nodes_namespace(
     topics |= {"/red/relative_rotations": CLOSURE, "/blue/relative_rotations": CLOSURE}
     plan = plan_for(topics, values=values)
     assert [source.topic for source in plan.odometry] == [odometry]
-    own = (
-        ["/blue/relative_rotations"]
-        if name == "/blue/rotavg"
-        else ["/blue/relative_rotations", "/red/relative_rotations"]
-    )
-    assert [source.topic for source in plan.edges] == own
+    assert [source.topic for source in plan.edges] == ["/blue/relative_rotations"]
 
 
 @pytest.mark.parametrize(
