@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
@@ -278,6 +279,10 @@ class BagReader:
             return BagReadError(f"{self._path}: permission denied; check the rights of the bag's files")
         known = isinstance(error, AnyReaderError | Rosbag1Error | Rosbag2Error)
         what = _one_line(error) if known else f"{type(error).__name__}: {_one_line(error)}"
+        if isinstance(error, FileNotFoundError) and self._path.is_dir():
+            what = f"it has no {_METADATA}, and no message in it can be read"
+        elif self._path.suffix == ".bag" and re.search("not indexed|index looks damaged", str(error)):
+            what = f"no index at its end; `rosbag reindex {shlex.quote(str(self._path))}` makes one"
         return BagReadError(f"{self._path}: not a readable bag, or a truncated one ({what})")
 
 

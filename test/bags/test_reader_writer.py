@@ -207,6 +207,14 @@ def test_broken_metadata(tmp_path: Path, metadata: str) -> None:
         pass
 
 
+def test_a_folder_of_recordings_in_which_nothing_is(tmp_path: Path) -> None:
+    (tmp_path / "killed").mkdir()
+    (tmp_path / "killed" / "killed_0.mcap").touch()
+    told = r"\(it has no metadata\.yaml, and no message in it can be read\)"
+    with pytest.raises(BagReadError, match=told), BagReader(tmp_path / "killed", salvage=True):
+        pass
+
+
 def test_paths_that_are_no_bags(tmp_path: Path) -> None:
     with pytest.raises(BagReadError, match="no such bag"):
         BagReader(tmp_path / "nothing")
@@ -325,7 +333,8 @@ def test_cut_files_that_other_tools_have_to_repair(tmp_path: Path, part: float) 
     for path in (sqlite_file, ros1_file):
         whole = path.read_bytes()
         path.write_bytes(whole[: int(part * len(whole))])
-        with pytest.raises(BagReadError, match="truncated"), BagReader(path, salvage=True):
+        told = "truncated" if path == sqlite_file else r"truncated.*`rosbag reindex .*old\.bag`"
+        with pytest.raises(BagReadError, match=told), BagReader(path, salvage=True):
             pass
 
 
