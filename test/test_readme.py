@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,19 @@ def test_every_command_is_in_the_table() -> None:
     section = README.partition("## The command line")[2]
     rows = re.findall(r"^\| `(\w+)", section, re.MULTILINE)
     assert set(rows) == {command.name for command in COMMANDS}
+
+
+def test_git_ignores_what_its_commands_write() -> None:
+    lines = (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()
+    ignored = [line.strip("/") for line in lines if line and not line.startswith(("#", "!"))]
+    written = set(re.findall(r"^    rotavg .*--output (\S+)", README, re.MULTILINE))
+    written |= set(re.findall(r"^    rotavg convert \S+ (\S+)", README, re.MULTILINE))
+    written |= set(re.findall(r"^    python3 -m venv (\S+)", README, re.MULTILINE))
+    written |= {
+        f"{stem}-statistics.png" for stem in re.findall(r"^    rotavg plot statistics (\w+)", README, re.MULTILINE)
+    }
+    assert written >= {"venv", "my_bag", "answer", "my_graph", "back.g2o", "my-statistics.png", "b25b"}
+    assert {name for name in written if not any(fnmatch(name, pattern) for pattern in ignored)} == set()
 
 
 def test_the_library_example() -> None:
