@@ -26,6 +26,7 @@ from rotavg_ros.datasets.files.text_rows import (
     shown,
     unit_quaternions,
     write_rows,
+    wrong_width,
 )
 from rotavg_ros.datasets.planar import quaternion_of_heading
 from rotavg_ros.rotations import inverse
@@ -221,8 +222,7 @@ def _parse_vertices(path: Path, num_values: int, lines: list[int], rows: list[Ro
     """Ids of the vertices. Their poses may be anything: a diverged estimate does not affect the measurements."""
     for line, row in zip(lines, rows, strict=True):
         if len(row) != 1 + num_values:
-            what = f"{len(row)} numbers where {1 + num_values} belong; the line is malformed or the file truncated"
-            raise GraphFileError.at(path, line, what)
+            raise GraphFileError.at(path, line, wrong_width(len(row), 1 + num_values))
     return parse_rows(path, lines, [row[:1] for row in rows], 1, 0)[0][:, 0]
 
 

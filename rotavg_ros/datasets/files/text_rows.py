@@ -96,10 +96,16 @@ def write_rows(file: TextIO, row_format: str, columns: list[np.ndarray]) -> None
         file.write((row_format * count) % tuple(islice(rows, count * width)))
 
 
+def wrong_width(number: int, needed: int) -> str:
+    """What is wrong with a row of so many numbers."""
+    numbers = "1 number" if number == 1 else f"{number} numbers"
+    return f"{numbers} where {needed} belong; the line is malformed or the file truncated"
+
+
 def _problem(row: Row, num_ids: int, num_columns: int) -> str | None:
     """What is wrong with a row, if anything."""
     if len(row) != num_columns:
-        return f"{len(row)} numbers where {num_columns} belong; the line is malformed or the file truncated"
+        return wrong_width(len(row), num_columns)
     for token in row[:num_ids]:
         if not token[token[:1] in (b"+", b"-") :].isdigit():
             return f"{shown(token)} is not an integer id"

@@ -55,7 +55,7 @@ def test_consecutive_cameras_are_not_odometry(tmp_path: Path) -> None:
         ("1_0 2 1 0 0 0 1 0 0 0 1 0 0 0", "'1_0' is not an integer id"),
         ("1 2 1 0 0 0 1 0 0 0 1 0 0 1_0", "'1_0' is not a number"),
         ("9" * 5000 + " 2 1 0 0 0 1 0 0 0 1 0 0 0", "too large"),
-        ("x", "1 numbers where 14 belong"),
+        ("x", "1 number where 14 belong"),
     ],
 )
 def test_bad_lines_are_named(tmp_path: Path, line: str, message: str) -> None:
