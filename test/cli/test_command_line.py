@@ -64,3 +64,12 @@ def test_a_word_that_may_be_left_out_stands_anywhere(words: str) -> None:
     assert (parsed.network, parsed.config, str(parsed.output)) == ("clean-net", "c.yaml", "w")
     left_out = parse(shlex.split(words.replace(" c.yaml", "")))
     assert (left_out.network, left_out.config) == ("clean-net", None)
+
+
+def test_help_of_what_goes_on_unasked(capsys: pytest.CaptureFixture[str]) -> None:
+    """`--graphs` limits neither what is played edge by edge nor the check of the uncertainty."""
+    with pytest.raises(SystemExit):
+        parse(["evaluate", "slam", "--help"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert "whatever --graphs says; without a name none" in told
+    assert "on graphs of its own" in told

@@ -103,12 +103,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=_INCREMENTAL,
         metavar="NAME",
         help="recorded: graphs to be played edge by edge, 30 %% false closures where made "
-        f"(default: {' '.join(_INCREMENTAL)})",
+        f"(default: {' '.join(_INCREMENTAL)}, whatever --graphs says; without a name none)",
     )
     parser.add_argument(
         "--uncertainty",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="recorded: compare the stated uncertainty with errors under known noise",
+        help="recorded: compare the stated uncertainty with errors under known noise, on graphs of its own",
     )
     add_data_argument(parser)
