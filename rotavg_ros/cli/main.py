@@ -43,7 +43,7 @@ COMMANDS = (
     Command("train", "rotavg_ros.cli.train", "train the networks"),
     Command("evaluate", "rotavg_ros.cli.evaluate", "compare the methods in tables and pictures"),
     Command("benchmark", "rotavg_ros.cli.benchmark", "time the solver beside COLMAP and GTSAM, the node under load"),
-    Command("plot", "rotavg_ros.cli.plot", "draw the statistics of a view-graph's noise"),
+    Command("plot", "rotavg_ros.cli.plot", "draw the statistics of a view-graph's noise, or of training"),
 )
 
 
