@@ -54,9 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.graph is None and (arguments.truth is not None or arguments.stamps is not None):
         raise DemoError("--truth and --stamps belong to --graph; give the graph as well")
     if arguments.graph is not None and (stated := _of_a_run(arguments)):
-        raise DemoError(
-            f"--graph is your own graph, and {', '.join(stated)} is of a simulated run; leave one of them out"
-        )
+        raise DemoError(f"--graph is your own graph; leave out {', '.join(stated)}, which is for simulated runs")
     try:
         from rotavg_ros.ros.harness.live_run import Playing, installed_node, keep_to_this_machine, play_to_node
     except ImportError as error:

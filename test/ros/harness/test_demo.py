@@ -62,7 +62,8 @@ def test_a_graph_without_odometry(tmp_path: Path, start_process: Callable) -> No
     [
         (["--truth", "truth.csv"], "belong to --graph"),
         (["--graph", "nothing.g2o"], "no such file"),
-        (["--graph", "mine.g2o", "--laps", "2"], "--graph is your own graph, and --laps is of a simulated run"),
+        (["--graph", "mine.g2o", "--laps", "2"], "leave out --laps, which is for simulated runs"),
+        (["--graph", "mine.g2o", "--grouped", "--seed", "4"], "leave out --grouped, --seed, which"),
         (["--laps", "0"], "--laps: is 0; it must be positive"),
         (["--rate", "nan"], "--rate: is nan; it must be 0 or more"),
     ],
